@@ -15,7 +15,7 @@ from pathlib import Path
 from mien.formats.page import write_packed
 from mien.runtime.baked import PortableAvatar
 from test_web import skinned_head
-from test_web_gpu import PAGE, opened
+from test_web_page import PAGE, opened
 from web_case import browse, build, drawn_head, painted_head, script, served
 
 HEADS: dict[str, Callable[[], PortableAvatar]] = {

@@ -4,8 +4,7 @@ A lock of its own, apart from mien's, tells whether a row runs twice at the same
 
 Its steps are words: `sleep SECONDS`, `wait NAME` (until the batch's folder has that file), `fail TEXT`, `once TEXT`
 (fail in the first try), `eat MEGABYTES`, `value NUMBER`, `make NAME` (a file in the workspace, and `drop NAME` removes
-it), `size PATH` (of a file, as the value). Commands of mien do nothing.
-"""
+it), `size PATH` (of a file, as the value). Commands of mien do nothing."""
 
 import fcntl
 import os

@@ -27,17 +27,12 @@ def random_capture(timesteps: int = 3, cameras: int = 2, height: int = 20, width
     valid[1, 0] = False
     landmarks[1, 0] = np.nan
     return Capture(
-        name="noise",
-        camera_ids=tuple(f"camera{index}" for index in range(cameras)),
-        fps=29.97,
+        name="noise", camera_ids=tuple(f"camera{index}" for index in range(cameras)), fps=29.97,
         timestamps=np.arange(timesteps) / 29.97,
         images=random.integers(0, 256, (timesteps, cameras, height, width, 3), dtype=np.uint8),
-        mattes=random.integers(0, 256, (timesteps, cameras, height, width), dtype=np.uint8),
-        landmarks=landmarks,
-        valid=valid,
-        principal_point=np.full((cameras, 2), 10.5),
-        source={"recipe": "noise", "seed": seed},
-    )
+        mattes=random.integers(0, 256, (timesteps, cameras, height, width), dtype=np.uint8), landmarks=landmarks,
+        valid=valid, principal_point=np.full((cameras, 2), 10.5), source={"recipe": "noise", "seed": seed},
+    )  # fmt: skip
 
 
 def assert_same_capture(one: Capture, other: Capture) -> None:
@@ -86,24 +81,15 @@ Codes = tuple[int, int, int, int]
 
 
 def encode(
-    path: Path,
-    frames: Sequence[np.ndarray | list[np.ndarray] | av.VideoFrame],
-    codec: str = "libx264",
-    pixels: str = "yuv420p",
-    *,
-    rate: int = 25,
-    options: dict[str, str] | None = None,
-    colors: Codes | None = None,
-    tags: Codes | None = None,
-    ticks: Sequence[int] | None = None,
+    path: Path, frames: Sequence[np.ndarray | list[np.ndarray] | av.VideoFrame], codec: str = "libx264",
+    pixels: str = "yuv420p", *, rate: int = 25, options: dict[str, str] | None = None, colors: Codes | None = None,
+    tags: Codes | None = None, ticks: Sequence[int] | None = None,
     prepare: Callable[[Any], object] = lambda stream: None,
-) -> None:
+) -> None:  # fmt: skip
     """Encode a video with FFmpeg, whose names of codecs and pixel formats are given.
-
     Frames are RGB pictures [h, w, 3], lists of planes of the pixel format, or as PyAV has them. `ticks` are their times
     in units of the rate. `colors` are stated by the codec's header and the frames, `tags` by the container. Without
-    options, libx264 keeps nearly every level. `prepare` changes the stream before anything is encoded.
-    """
+    options, libx264 keeps nearly every level. `prepare` changes the stream before anything is encoded."""
     given = [_frame_of(frame, pixels) for frame in frames]
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate, options=options or ({"crf": "1"} if codec == "libx264" else {}))
@@ -142,8 +128,7 @@ def _frame_of(given: np.ndarray | list[np.ndarray] | av.VideoFrame, pixels: str)
 
 
 def write_planes(path: Path, pictures: list[np.ndarray], pixels: str, colors: Codes = (1, 1, 1, 1), ticks=None) -> None:
-    """Write a lossless .mkv (FFV1) of exactly these Y'CbCr planes [3, h, w], 4:4:4, at 25 frames a second or at ticks
-    of milliseconds."""
+    """Write a lossless .mkv (FFV1) of these Y'CbCr planes [3, h, w], 4:4:4, at 25 frames a second or at ticks in ms."""
     encode(path, list(map(list, pictures)), "ffv1", pixels, rate=1000 if ticks else 25, colors=colors, ticks=ticks)
 
 

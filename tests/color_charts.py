@@ -1,7 +1,4 @@
-"""Corrections of a camera's colours by the formula of Cheung 2004, and what a camera films that needs one.
-
-Nothing here calls mien.
-"""
+"""Corrections of colours by the formula of Cheung 2004, and what a camera films that needs one, without mien."""
 
 import numpy as np
 
@@ -9,21 +6,13 @@ _FIRST, _SECOND, _MIXED = "100 010 001", "110 101 011", "200 020 002"
 _TEN = f"{_FIRST} {_SECOND} {_MIXED} 111"
 _NINETEEN = f"{_TEN} 210 021 102 201 120 012 300 030 003"
 ORDERS = {
-    3: _FIRST,
-    4: f"{_FIRST} 000",
-    5: f"{_FIRST} 111 000",
-    7: f"{_FIRST} {_SECOND} 000",
-    8: f"{_FIRST} {_SECOND} 111 000",
-    10: f"{_FIRST} {_SECOND} {_MIXED} 000",
-    11: f"{_TEN} 000",
-    14: f"{_TEN} 300 030 003 000",
-    16: f"{_TEN} 210 021 102 300 030 003",
-    17: f"{_TEN} 210 021 102 300 030 003 000",
-    19: _NINETEEN,
-    20: f"{_NINETEEN} 000",
+    3: _FIRST, 4: f"{_FIRST} 000", 5: f"{_FIRST} 111 000", 7: f"{_FIRST} {_SECOND} 000",
+    8: f"{_FIRST} {_SECOND} 111 000", 10: f"{_FIRST} {_SECOND} {_MIXED} 000", 11: f"{_TEN} 000",
+    14: f"{_TEN} 300 030 003 000", 16: f"{_TEN} 210 021 102 300 030 003",
+    17: f"{_TEN} 210 021 102 300 030 003 000", 19: _NINETEEN, 20: f"{_NINETEEN} 000",
     22: f"{_NINETEEN} 211 121 112",
     35: f"{_NINETEEN} 310 301 130 031 103 013 211 121 112 220 202 022 400 040 004 000",
-}
+}  # fmt: skip
 """The terms of each polynomial in order: the powers of red, green and blue."""
 
 

@@ -85,10 +85,8 @@ MadeOnce = Callable[[str, Callable[[Path], object]], Path]
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
     """Return a function that makes a folder once for all workers of this run.
-
     `made_once(name, make)` calls `make(folder)` in the first worker that asks for the name, without checks of types,
-    and returns the folder, which is for reading. The others wait for it. Nothing is kept for the next run.
-    """
+    and returns the folder, which is for reading. The others wait for it. Nothing is kept for the next run."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if os.environ.get("PYTEST_XDIST_WORKER") else base) / "made_once"
     shared.mkdir(exist_ok=True)

@@ -1,7 +1,5 @@
 """Cases of the fuzzer of datasets: a small dataset of each layout, one fault in it, and what may come of that.
-
-A case is a layout and a number; the number decides the fault and the way in which the dataset is read.
-"""
+A case is a layout and a number; the number decides the fault and the way in which the dataset is read."""
 
 import shutil
 import time
@@ -45,7 +43,7 @@ from mien.pipeline import import_dataset as import_footage
 from mien.pipeline.import_dataset import run_import_stage
 from mien.training import read_sequence
 from mien.training.splits.own import read_own_split
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
 
 SIDE = 32
 _BY_COMMAND, _RETRACKED = 5, 7
@@ -220,8 +218,7 @@ class Campaign:
         """Read and write a dataset as `mien import` does.
 
         Raises:
-            UserError: it is damaged.
-        """
+            UserError: it is damaged."""
         known = [each for each in datasets() if each.recognises(path) is not None]
         if not known:
             raise UserError(f"{path}: is no dataset")

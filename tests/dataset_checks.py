@@ -24,8 +24,7 @@ METRES = 1e-5
 CAMERA = 1e-6
 """Largest error of a camera: of rotations, of places in metres, and of intrinsics as a part of each.
 
-Captures hold float32, whose neighbours at 150 pixels are 1.5e-5 apart, so no absolute bound of 1e-6 can hold there.
-"""
+Captures hold float32, whose neighbours at 150 pixels are 1.5e-5 apart, so no absolute bound of 1e-6 can hold there."""
 LANDMARKS = 4e-5
 """Largest error of a landmark, as a part of the height of the picture."""
 _SURE = 99
@@ -62,10 +61,8 @@ def check_projection(
     which: np.ndarray | slice = slice(None),
 ) -> None:  # fmt: skip
     """Check the imported face and camera against some of the writer's vertices, and the writer's camera.
-
     Where a moving camera became a moving head, what is compared is the motion from the writer's world to the camera.
-    The writer's world is `scale` times as large.
-    """
+    The writer's world is `scale` times as large."""
     K, rotation, translation = view
     found = sequence.tracking.cameras[camera]
     stored = filmed_camera(sequence, camera)
@@ -138,8 +135,7 @@ def check_import(found: list[Any], layout: Layout, scene: Scene) -> None:
     for sequence, (name, timesteps), split in zip(found, layout.clips.items(), layout.splits, strict=True):
         assert isinstance(sequence, TrackedSequence)
         assert (sequence.capture.name, sequence.capture.camera_ids) == (name, layout.cameras)
-        assert sequence.own_split == split
-        assert sequence.capture.timesteps == len(timesteps)
+        assert (sequence.own_split, sequence.capture.timesteps) == (split, len(timesteps))
         for row, timestep in enumerate(timesteps):
             vertices = layout.vertices(shown, timestep)
             for camera in range(len(layout.cameras)):

@@ -107,9 +107,7 @@ UNITED = ("306_EMO-1", "306_EXP-2")
 
 def write_union(union: Path, scene: Scene) -> Path:
     """Write a UNION folder, and beside it two exports of VHAP, whose timesteps go on in the second.
-
-    The second sequence is held out, and of the first the last camera.
-    """
+    The second sequence is held out, and of the first the last camera."""
     parts: dict[str, list[dict]] = {"train": [], "val": [], "test": []}
     for index, name in enumerate(UNITED):
         export = writers.write_vhap(union.with_name(name), scene)

@@ -1,7 +1,5 @@
 """A head in FLAME's schema in front of cameras, drawn for the writers of datasets.
-
-Vertices come from `posed_as_flame`, a forward pass of its own, in float64. Nothing here calls the importers.
-"""
+Vertices come from `posed_as_flame`, a forward pass of its own, in float64. Nothing here calls the importers."""
 
 import contextlib
 import tempfile

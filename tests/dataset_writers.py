@@ -202,8 +202,7 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6, detected: bool
 
     The neck is at rest if landmarks are those of the drawn head (`detected`), as that of a rigid pose.
 
-    A ray of the file through the whole pixel (u, v) has the direction R ((u - cx) / fx, -(v - cy) / fy, -1).
-    """
+    A ray of the file through the whole pixel (u, v) has the direction R ((u - cx) / fx, -(v - cy) / fy, -1)."""
     order = [2, 0, 3, 1]  # number of each training picture in the clip
     index = np.stack([np.arange(5.0), [*np.argsort(order), -1]], axis=1)
     mirror = np.diag([-1.0, 1.0, 1.0])
@@ -227,7 +226,6 @@ def write_nerface(folder: Path, scene: Scene, scale: float = 0.6, detected: bool
 
 def write_nerf_blendshape(folder: Path, scene: Scene, scale: float = 1.0, detected: bool = False) -> Path:
     """Write a person of NeRFBlendShape, from picture 7 on and with a gap, in a world of another scale.
-
     Landmarks are made up, or those of the drawn head (`detected`), whose neck is then at rest as that of a rigid pose.
     """
     frames = []
@@ -272,9 +270,7 @@ def write_benchmark(
     clips: tuple[str, ...] = ("EXP-2-eyes",),
 ) -> Path:  # fmt: skip
     """Write a person of the NeRSemble benchmark. The frames are divided among the clips.
-
-    If it is tracked, FREE is a test sequence that has a tracking only.
-    """
+    If it is tracked, FREE is a test sequence that has a tracking only."""
     random = np.random.default_rng(8)
     angles, shifts = random.uniform(-0.3, 0.3, (len(scene), 3)), random.uniform(-0.03, 0.03, (len(scene), 3))
     poses, share = {}, len(scene) // len(clips)
@@ -318,9 +314,7 @@ def write_nersemble(
     colors: Mapping[str, np.ndarray] | None = None,
 ) -> Path:  # fmt: skip
     """Write a person of NeRSemble's raw recordings. `film` writes the video of a camera, instead of empty files.
-
-    `colors` has the correction [3, n] of each camera's colours.
-    """
+    `colors` has the correction [3, n] of each camera's colours."""
     (folder / "calibration").mkdir(parents=True)
     K = [[8000.0, 0, 1100], [0, 8000, 1604], [0, 0, 1]]
     content = {"world_2_cam": dict.fromkeys(serials, np.eye(4).tolist()), "intrinsics": K}

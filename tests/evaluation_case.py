@@ -58,11 +58,10 @@ def _motion(face: FaceParams) -> FaceParams:
     along = torch.linspace(0, 6.0, len(face))
     still = torch.zeros_like(along)
     return replace(
-        face,
-        expression=0.5 + 0.5 * torch.sin(along[:, None] + torch.arange(face.expression.shape[1])),
+        face, expression=0.5 + 0.5 * torch.sin(along[:, None] + torch.arange(face.expression.shape[1])),
         head_rotation=torch.stack([0.1 * along.cos(), 0.4 * along.sin(), still], dim=-1),
         head_translation=torch.stack([0.01 * along.sin(), still, still - 0.5], dim=-1),
-    )
+    )  # fmt: skip
 
 
 def _paint(avatar: Avatar) -> None:

@@ -11,8 +11,7 @@ It sees, in the thread that enters it:
 It does not see the inside of the native core and of OpenCV's filters, other threads, what runs when a module is
 imported, and numpy's functions that were imported by name (ruff's style keeps them out). numpy's sums are allowed,
 since their order is that of one source for all processors, and so are functions such as `exp`, whose last bit may
-differ: tolerances allow for it.
-"""
+differ: tolerances allow for it."""
 
 import dis
 import sys

@@ -1,8 +1,7 @@
 """Make a head in FLAME's schema from the anny model, with other vertices, other joints and other bases.
 
 Identity and expression are linear bases without names. The jaw is a joint that moves skin. Through pose correctives
-the lids follow the eyes, and the lips follow the jaw. It contains nothing of FLAME's own.
-"""
+the lids follow the eyes, and the lips follow the jaw. It contains nothing of FLAME's own."""
 
 import pickle
 import sys
@@ -36,15 +35,13 @@ def flame_like(anny: FaceModel) -> dict[str, np.ndarray]:
     expression = _expression_basis(anny, order)
     identity = anny.identity_basis.double().numpy()[:IDENTITIES, order]
     return {
-        "v_template": template + _SHIFT,
-        "f": faces.astype(np.uint32),
+        "v_template": template + _SHIFT, "f": faces.astype(np.uint32),
         "shapedirs": np.moveaxis(np.concatenate([identity, expression]), 0, 2).astype(np.float32),
         "posedirs": np.moveaxis(posedirs.reshape(36, -1, 3), 0, 2).astype(np.float32),
-        "J_regressor": _regressor(template, weights, hinge),
-        "weights": weights,
+        "J_regressor": _regressor(template, weights, hinge), "weights": weights,
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]], np.int64),
         "identities": np.array(IDENTITIES),
-    }
+    }  # fmt: skip
 
 
 def _cut(anny: FaceModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -173,10 +170,8 @@ def posed_as_flame(
     offsets: np.ndarray | float = 0.0,
 ) -> np.ndarray:  # fmt: skip
     """Return vertices [v, 3] by the formulas of GaussianAvatars (methods.md A.1), in float64.
-
     `pose` [5, 3] holds the axis-angles of root, neck, jaw and eyes; `shape` holds all coefficients. Joints are
-    regressed from the shaped vertices: identity, expression and static offsets [v, 3].
-    """
+    regressed from the shaped vertices: identity, expression and static offsets [v, 3]."""
     shaped = shaped_as_flame(arrays, shape, offsets)
     joints = arrays["J_regressor"] @ shaped
     turns = matrix_from_axis_angle(torch.from_numpy(pose)).numpy()

@@ -1,8 +1,7 @@
 """Commands in processes of their own that start at once: forks of a server that has imported torch and the commands.
 
 For tests about processes: signals, kills, two commands at the same time. A process has no checks of types, as at users.
-Start-up, missing packages and other interpreters need a process that Python starts anew.
-"""
+Start-up, missing packages and other interpreters need a process that Python starts anew."""
 
 import atexit
 import gc
@@ -85,19 +84,12 @@ class ForkServer:
         return self.call("mien.cli:main", list(map(str, words)), exits=True, **options)
 
     def call(
-        self,
-        function: str,
-        *arguments: Any,
-        cwd: Path | None = None,
-        env: dict[str, str] | None = None,
-        path: Sequence[Path] = (),
-        exits: bool = False,
-    ) -> Forked:
+        self, function: str, *arguments: Any, cwd: Path | None = None, env: dict[str, str] | None = None,
+        path: Sequence[Path] = (), exits: bool = False,
+    ) -> Forked:  # fmt: skip
         """Start a process that calls a function, as in "module:name", with arguments that json can carry.
-
         Modules of tests are found, and those in the folders of `path`. Without `cwd`, its folder is that of the tests,
-        and the variables of `env` are set on top of today's. `exits` says that what it returns is the exit code.
-        """
+        and the variables of `env` are set on top of today's. `exits` says that what it returns is the exit code."""
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()

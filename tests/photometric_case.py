@@ -49,9 +49,7 @@ def smooth_noise(height: int, width: int, blur: float, seed: int = 3) -> Tensor:
 
 def make_photometric_case(timesteps: int = 16, shake: float = 0.5) -> PhotometricCase:
     """Draw the head.
-
-    Its landmarks err like a detector's: together by up to `shake` pixels per frame, and each by a little.
-    """
+    Its landmarks err like a detector's: together by up to `shake` pixels per frame, and each by a little."""
     model = make_textured_model()
     layout = layout_of(model)
     time = torch.arange(timesteps, dtype=torch.float64) / 25

@@ -1,7 +1,5 @@
 """Plain settings of methods and runs: small, fast, with open sides, and without what the defaults add to the papers.
-
-Tests of a formula or a mechanism use them, so that a change of a default does not change what they check.
-"""
+Tests of a formula or a mechanism use them, so that a change of a default does not change what they check."""
 
 from dataclasses import replace
 from typing import Any
@@ -26,11 +24,9 @@ def plain_run(**changes: Any) -> TrainSettings:
 def plain_config(method: str, **changes: Any) -> MethodConfig:
     """Plain settings of a method. Those of a method without any here are its defaults."""
     plain = {
-        "gaussian_avatars": plain_gaussian_avatars,
-        "mono_gaussian_avatar": plain_mono_gaussian_avatar,
-        "point_avatar": plain_point_avatar,
-        "textured_mesh": plain_textured_mesh,
-    }
+        "gaussian_avatars": plain_gaussian_avatars, "mono_gaussian_avatar": plain_mono_gaussian_avatar,
+        "point_avatar": plain_point_avatar, "textured_mesh": plain_textured_mesh,
+    }  # fmt: skip
     return replace(plain.get(method, METHODS[method].config)(), **changes)
 
 

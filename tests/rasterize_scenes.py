@@ -32,12 +32,9 @@ class Scene:
 
 
 def rasterize_anywhere(
-    gaussians: Gaussians,
-    camera: Camera | Sequence[Camera],
-    background: Tensor | None = None,
-    backend: Backend = "auto",
-    depth: bool = False,
-) -> Rendering:
+    gaussians: Gaussians, camera: Camera | Sequence[Camera], background: Tensor | None = None,
+    backend: Backend = "auto", depth: bool = False,
+) -> Rendering:  # fmt: skip
     """Call `rasterize` with CPU tensors, on the GPU if the back end needs one. The picture is returned on the CPU."""
     if backend != "gsplat":
         return rasterize(gaussians, camera, background, backend, depth)
@@ -49,10 +46,7 @@ def rasterize_anywhere(
 
 
 def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int = 61, height: int = 45) -> Scene:
-    """Return Gaussians of all shapes around a tilted camera.
-
-    Some are behind it, outside of the picture or transparent.
-    """
+    """Return Gaussians of all shapes around a tilted camera, some behind it, outside of the picture or transparent."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -60,13 +54,10 @@ def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int 
 
     pose = rigid_transform(matrix_from_axis_angle(0.3 * normal(3)), 0.1 * normal(3))
     gaussians = Gaussians(
-        means=normal(count, 3) * torch.tensor([0.5, 0.5, 0.4]),
-        quats=normal(count, 4),
-        scales=0.02 * torch.exp(normal(count, 3)),
-        opacities=torch.rand(count, generator=generator),
-        sh=0.4 * normal(count, coefficients, 3),
-        T_world_local=pose,
-    )
+        means=normal(count, 3) * torch.tensor([0.5, 0.5, 0.4]), quats=normal(count, 4),
+        scales=0.02 * torch.exp(normal(count, 3)), opacities=torch.rand(count, generator=generator),
+        sh=0.4 * normal(count, coefficients, 3), T_world_local=pose,
+    )  # fmt: skip
     viewmat = rigid_transform(matrix_from_axis_angle(0.2 * normal(3)), torch.tensor([0.05, -0.02, 0.9]))
     focal = 1.1 * width
     K = torch.tensor([[focal, 0, 0.48 * width], [0, 1.2 * focal, 0.55 * height], [0, 0, 1]])
@@ -75,9 +66,7 @@ def random_scene(seed: int, count: int = 200, coefficients: int = 4, width: int 
 
 def comparable_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Tensor:
     """Return the pixels [h, w] that do not change when the two cutoffs move a little.
-
-    At the others, an alpha or a transmittance is so close to its cutoff that rounding decides.
-    """
+    At the others, an alpha or a transmittance is so close to its cutoff that rounding decides."""
     pictures = []
     for factor in (1 - 1e-4, 1 + 1e-4):
         with monkeypatch.context() as patch:

@@ -3,8 +3,7 @@
 Pixels differ between processors by a grey level here and there, since `exp`, `sin` and OpenCV's filters may round their
 last bit differently. So a capture is identified by its key, and the signature checks that two machines draw the same.
 
-`python tests/reference_signatures.py` rewrites the file with those of tiny versions of the reference captures.
-"""
+`python tests/reference_signatures.py` rewrites the file with those of tiny versions of the reference captures."""
 
 import json
 from collections.abc import Mapping
@@ -33,10 +32,8 @@ mm; one such step is allowed."""
 
 def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     """Return the means and standard deviations of picture blocks, the means of matte blocks, landmarks and vertices.
-
     The pictures are those of the first, middle and last timestep from the first and the last camera. The parts are flat
-    lists in grey levels, pixels and millimetres.
-    """
+    lists in grey levels, pixels and millimetres."""
     timesteps = sorted({0, scene.timesteps // 2, scene.timesteps - 1})
     cameras = sorted({0, len(scene.cameras) - 1})
     frames = [frame for step in timesteps for frame in scene.timestep_frames(step, cameras)]
@@ -44,12 +41,10 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     index, vertices, landmarks = surface_of(scene)
     vertices = vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
     parts = {
-        "means": _blocks(images).mean((2, 4)),
-        "spreads": _blocks(images).std((2, 4)),
+        "means": _blocks(images).mean((2, 4)), "spreads": _blocks(images).std((2, 4)),
         "mattes": _blocks(mattes[..., None]).mean((2, 4)),
-        "landmarks": landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)],
-        "vertices": 1000 * vertices,
-    }
+        "landmarks": landmarks[timesteps][:, cameras][:, :, list(_LANDMARKS)], "vertices": 1000 * vertices,
+    }  # fmt: skip
     return {name: np.round(values.astype(np.float64), 3).ravel().tolist() for name, values in parts.items()}
 
 

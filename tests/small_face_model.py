@@ -22,7 +22,6 @@ def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int =
     offsets = (0, len(skull), len(skull) + len(ball))
     faces = torch.cat([skull_faces + offsets[0], ball_faces + offsets[1], ball_faces + offsets[2]])
     regions = (torch.arange(len(faces)) >= len(skull_faces)).long()
-
     weights = torch.zeros(len(template), 5)
     jaw = torch.sigmoid((-0.03 - skull[:, 1]) * 100) * torch.sigmoid((skull[:, 2] - 0.04) * 200)
     neck = torch.sigmoid((-0.08 - skull[:, 1]) * 200) * (skull[:, 2] <= 0)
@@ -32,7 +31,6 @@ def make_small_face_model(identities: int = 6, expressions: int = 8, seed: int =
     weights[offsets[2] :, 3] = 1
     moved = torch.zeros(len(template))
     moved[: len(skull)] = torch.sigmoid(skull[:, 2] * 200)
-
     rotation_basis = torch.zeros(expressions, 5, 3)
     rotation_basis[0, 4, 0] = 0.25
     bounds = torch.tensor([[0.0, 1.0]]).repeat(expressions, 1)

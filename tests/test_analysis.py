@@ -28,8 +28,7 @@ from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.spec import Analysis, AnalysisOptions, Part
 from mien.pages.plots import Axes, Series
 from mien.training.run import read_curves
-from shared_things import MadeOnce, toy_workspace
-from toy_workspace import write_toy_workspace
+from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 from web_case import violations
 
 pytestmark = pytest.mark.unchecked

@@ -25,9 +25,8 @@ from mien.lab.analysis.spec import AnalysisOptions
 from mien.lab.analysis.views import head_camera, labeled, mouth_camera
 from mien.media.video import count_frames
 from mien.runtime.filmed import head_angles
-from shared_things import MadeOnce
+from shared_things import MadeOnce, write_toy_workspace
 from toy_scene import toy_camera, toy_face, toy_face_model
-from toy_workspace import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
 _GROWTH = GradientSettings(start=0.2, stop=0.8, rounds=3, grow_gradient=1e-4, opacity_resets=(), max_gaussians=150)
@@ -102,8 +101,7 @@ def test_the_ablations_are_trained_alike(workspace: Path, capsys: pytest.Capture
 def test_rows_differ_only_in_what_they_say() -> None:
     plain = ablations.ablation_configs(CONFIG)
     assert "no_perceptual" not in plain
-    assert plain["full"] == CONFIG
-    assert plain["delta"] == replace(CONFIG, variant="delta")
+    assert (plain["full"], plain["delta"]) == (CONFIG, replace(CONFIG, variant="delta"))
     config = replace(CONFIG, variant="no_mlp", photometric=Photometric(perceptual=PerceptualLoss(weight=0.1)))
     rows = ablations.ablation_configs(config)
     assert list(rows) == list(ablations.PAPER)

@@ -19,9 +19,8 @@ from mien.lab.analysis.mono_gaussian_avatar.subsets import Measured, frontal_qua
 from mien.training import TrainSettings
 from mien.training.footage.frames import training_frames
 from plain_settings import plain_mono_gaussian_avatar
-from shared_things import MadeOnce
+from shared_things import MadeOnce, write_toy_workspace
 from toy_scene import toy_sequence
-from toy_workspace import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
 CONFIG = plain_mono_gaussian_avatar(points=60, max_points=120, epochs=10)

@@ -1,7 +1,5 @@
 """Bad input is refused in one line. docs/bad_input.md lists for every command which test shows this.
-
-On a full disk, every writer says so, and keeps the file of before; then the same command succeeds.
-"""
+On a full disk, every writer says so, and keeps the file of before; then the same command succeeds."""
 
 import errno
 import importlib.util
@@ -41,6 +39,7 @@ from mien.tracking.scoring_files import write_scoring
 from mien.training.checkpoint import checkpoint_files
 from mien.training.run import read_run_config, read_training_summary
 from needs import NO_MOUNT
+from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
 from toy_scene import toy_sequence
 
@@ -105,34 +104,27 @@ def test_bad_json_and_tensors(tmp_path: Path) -> None:
         readers = [lambda: read_json(path, "x", 1)] if data in JSON else [lambda: read_arrays(path)]
         readers += [lambda: read_tensors(path)] * (data in TENSORS and b"BF16" not in data)
         for read in readers:
-            with pytest.raises(UserError, match=message):
-                read()
+            refuses(message, read)
     path.write_bytes(tensors_file(b"{}"))
     os.truncate(path, 1 << 40)
-    with pytest.raises(UserError, match="and at most"):
-        read_arrays(path)
+    refuses("and at most", read_arrays, path)
 
 
 def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_path: Path) -> None:
     readers = {"config.json": read_run_config, "metrics.json": read_metrics, "training.json": read_training_summary}
     for name, read in readers.items():
         (tmp_path / name).touch()
-        with pytest.raises(UserError, match="cannot be read as json") as error:
-            read(tmp_path)
-        assert "delete its folder" not in str(error.value)
-    with pytest.raises(UserError, match="delete this file, not its folder, and run `mien evaluate` again"):
-        read_metrics(tmp_path)
+        error = refuses("cannot be read as json", read, tmp_path)
+        assert "delete its folder" not in error
+    refuses("delete this file, not its folder, and run `mien evaluate` again", read_metrics, tmp_path)
     shutil.copytree(run_dir / "avatar", tmp_path / "avatar")
     for name in ("face_model.safetensors", "avatar.json"):
         path = tmp_path / "avatar" / name
         path.write_bytes(path.read_bytes()[:40])
-        with pytest.raises(UserError, match=rf"{name}: .*; delete the run's training.json, .* again with `mien train`"):
-            load_avatar(tmp_path)
+        refuses(rf"{name}: .*; delete the run's training.json, .* again with `mien train`", load_avatar, tmp_path)
 
 
-def test_a_damaged_run_is_trained_again_as_advised(
-    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_run_is_trained_again_as_advised(run_dir: Path, tmp_path: Path, capsys) -> None:
     """A damaged avatar is made again, and a damaged checkpoint is replaced by the older one, which is said."""
     copy = shutil.copytree(run_dir, tmp_path / "copy")
     (copy / "avatar" / "face_model.safetensors").unlink()
@@ -155,22 +147,16 @@ def test_a_damaged_run_is_trained_again_as_advised(
             assert (copy / "avatar" / name).read_bytes() == (run_dir / "avatar" / name).read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (OSError(errno.ENOSPC, "No space left on device", "/x/a.png"), "/x/a.png: No space left"),
-        (MemoryError("8 GiB"), "not enough memory"),
-    ],
-)
-def test_a_full_disk_or_memory_anywhere_is_no_bug(
-    error: Exception, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize(("error", "words"), [
+    (OSError(errno.ENOSPC, "No space left on device", "/x/a.png"), "/x/a.png: No space left"),
+    (MemoryError("8 GiB"), "not enough memory"),
+])  # fmt: skip
+def test_a_full_disk_or_memory_anywhere_is_no_bug(error: Exception, words: str, tmp_path, monkeypatch, capsys) -> None:
     def fail(_: object) -> None:
         raise error
 
     monkeypatch.setattr("mien.disk.workspace.Workspace.sequence_names", fail)
-    assert main(["track", str(tmp_path)]) == 2
-    assert words in capsys.readouterr().err
+    assert words in complaint(capsys, "track", str(tmp_path))
 
 
 def test_workspaces_in_odd_places(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -185,17 +171,13 @@ def test_workspaces_in_odd_places(run_dir: Path, tmp_path: Path, capsys: pytest.
             (tmp_path / "out", "is a file"),
             *((outer / name, f"inside the workspace {outer}") for name in ("runs", "sequences/other", "runs/new/deep")),
         ):
-            assert main([command, str(tmp_path / "a.mp4"), "--out", str(place)]) == 2
-            shown = capsys.readouterr().err
+            shown = complaint(capsys, command, str(tmp_path / "a.mp4"), "--out", str(place))
             assert words in shown
             assert "disk space" not in shown
-    assert (tmp_path / "out").read_text() == "mine"
-    assert sorted(tmp_path.rglob("*")) == before
-    with pytest.raises(UserError, match="is a file; give the folder of a workspace"):
-        open_workspace(tmp_path / "a.mp4")
+    assert ((tmp_path / "out").read_text(), sorted(tmp_path.rglob("*"))) == ("mine", before)
+    refuses("is a file; give the folder of a workspace", open_workspace, tmp_path / "a.mp4")
     (tmp_path / "me/runs").mkdir(parents=True)
-    with pytest.raises(UserError, match="there is no run yet; make one with `mien train"):
-        Workspace(tmp_path / "me").pick_run(None)
+    refuses("there is no run yet; make one with `mien train", Workspace(tmp_path / "me").pick_run, None)
 
 
 def test_every_row_of_the_table_names_a_test_that_exists() -> None:
@@ -208,8 +190,6 @@ def test_every_row_of_the_table_names_a_test_that_exists() -> None:
             source = (Path(__file__).parent / f"{file}.py").read_text(encoding="utf-8")
             assert f"def {test}(" in source, f"{file}.py has no {test}"
 
-
-# Full disks -----------------------------------------------------------------------------------------------------------
 
 USD = ("usd", "usda", "usdc", "usdz")
 ENDINGS = ("mien", "html", "packed", "glb", "ply", "spz", "sog", *(USD if importlib.util.find_spec("pxr") else ()))
@@ -285,9 +265,7 @@ def test_a_full_disk_leaves_the_avatar_that_was_there(given: Path, tmp_path: Pat
 @pytest.fixture(params=["limit", "mount"])
 def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Return a folder, and what fills its disk: a limit, or a disk of 16 MiB in memory.
-
-    On the latter, the temporary files of libraries are on the full disk, too.
-    """
+    On the latter, the temporary files of libraries are on the full disk, too."""
     if request.param == "limit":
         yield tmp_path, small_disk
         return
@@ -313,9 +291,7 @@ def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_an_export_on_a_full_disk_keeps_the_earlier_file(
-    name: str, given: Path, disk: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_on_a_full_disk_keeps_the_earlier_file(name: str, given, disk: Any, capsys, monkeypatch) -> None:
     """Write once, then on a disk that is filled at a random place, then again."""
     monkeypatch.setattr(write_glb, "__defaults__", (128,))  # the usual size takes ten seconds
     folder, filled = disk

@@ -15,6 +15,7 @@ import pytest
 
 from batch_stub import PROGRAM, do_stub, driver, ended, stub_row, wait_for_begin
 from forked import ForkServer
+from known import known
 from mien.batch import EngineOptions, Row
 from mien.batch.drive import Driver, shard_of
 from mien.batch.plan import Batch, State
@@ -26,8 +27,8 @@ from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.disk.files import write_atomically
 from mien.disk.locks import hold
-from mien.errors import UserError
 from other_process import Holder
+from refusals import complaint, refuses
 
 
 def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
@@ -44,8 +45,7 @@ def test_a_process_that_never_claims_its_row_fails_anew_each_time(tmp_path: Path
     programs = (("false",), f"{silent} 1"), (("sh", "-c", "echo 'mien: no room'; exit 7"), "no room")
     for tries, (program, told) in enumerate((*programs, (("true",), f"{silent} 0")), start=1):
         Driver(batch, "local", EngineOptions(tmp_path, 1, 1), 0, "", program).run([row])
-        state = batch.read_state("ann")
-        assert state is not None
+        state = known(batch.read_state("ann"))
         assert (state.status, state.tries) == ("failed", tries)
         assert state.error.startswith(told)
 
@@ -98,8 +98,7 @@ def test_shards_share_all_rows_out():
     shards = [row.name for index in (1, 2, 3) for row in shard_of(rows, f"{index}/3")]
     assert sorted(shards) == [row.name for row in rows]
     for wrong in ("0/3", "4/3", "1", "a/b", "-1/3"):
-        with pytest.raises(UserError, match="--shard"):
-            shard_of(rows, wrong)
+        refuses("--shard", shard_of, rows, wrong)
 
 
 def test_a_failing_row_stops_no_other_and_is_tried_again(tmp_path: Path):
@@ -125,8 +124,7 @@ def test_a_row_whose_process_is_killed_is_tried_again(tmp_path: Path, fork_serve
     os.kill(wait_for_begin(tmp_path, "victim"), signal.SIGKILL)
     (tmp_path / "go").touch()
     assert running.wait() == 0
-    state = batch.read_state("victim")
-    assert state is not None
+    state = known(batch.read_state("victim"))
     assert (state.status, state.tries, state.runs[0]["psnr"]) == ("done", 2, 21.0)
     assert batch.is_done(other)
 
@@ -217,17 +215,6 @@ def check_store(batch: Batch, store: str, *steps: tuple[str, str]) -> None:
     assert not (batch.root / "begins.txt").exists()  # it ran elsewhere
 
 
-# Of strangers ---------------------------------------------------------------------------------------------------------
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must be refused in one line, and return the line."""
-    capsys.readouterr()
-    assert main(list(arguments)) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mien: ")]
-    return line
-
-
 @pytest.mark.parametrize(("name", "text"), [
     ("a.csv", "video,preset\nann.mp4,draft;--out;/elsewhere\n"),
     ("a.csv", "video;preset\nann.mp4;--out=/elsewhere\n"),
@@ -237,8 +224,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_a_cell_is_never_an_option(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / "ann.mp4").touch()
     (tmp_path / name).write_text(text)
-    with pytest.raises(UserError, match=r"row 1: column '(preset|capture.mattes)' holds '-.*would be an option; give"):
-        read_table(tmp_path / name)
+    refuses(r"row 1: column '(preset|capture.mattes)' holds '-.*would be an option; give", read_table, tmp_path / name)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le"])
@@ -267,11 +253,9 @@ def test_no_link_in_a_batch_is_followed(tmp_path: Path, place: str) -> None:
     link.symlink_to(outside)
     ways = {"states": batch.state_file, "logs": batch.log_file, "rows": batch.workspace}
     way = ways.get(place.split("/")[0], lambda name: batch.place("thumbs", f"{name}.jpg"))
-    with pytest.raises(UserError, match="is a link, and links"):
-        way("ann")
+    refuses("is a link, and links", way, "ann")
     if place.startswith("logs"):
-        with pytest.raises(UserError, match="is a link, and links"):
-            attempt(batch.root, stub_row("ann"), PROGRAM)
+        refuses("is a link, and links", attempt, batch.root, stub_row("ann"), PROGRAM)
     assert outside.read_text() == "mine" if "." in place else not any(outside.iterdir())
 
 
@@ -300,7 +284,7 @@ def test_hostile_states_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[s
     batch.state_file("ann").write_text(content)
     assert main(["batch", "status", str(tmp_path)]) == 0
     assert f"{batch.state_file('ann')}: damaged (" in capsys.readouterr().out.replace("\n", "")
-    assert "no row is done yet" in refused(capsys, "batch", "table", str(tmp_path))
+    assert "no row is done yet" in complaint(capsys, "batch", "table", str(tmp_path))
 
 
 def test_formulas_in_headings_are_defused(tmp_path: Path) -> None:
@@ -332,5 +316,4 @@ def test_outputs_follow_the_umask(tmp_path: Path, mask: int, mode: int) -> None:
 
 def test_a_list_of_files_is_no_film(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_text("ffconcat version 1.0\nfile secret.mp4\n")
-    with pytest.raises(UserError, match=r"film\.mp4: is a list of files"):
-        write_strip(tmp_path / "film.mp4", tmp_path / "a.jpg")
+    refuses(r"film\.mp4: is a list of files", write_strip, tmp_path / "film.mp4", tmp_path / "a.jpg")

@@ -1,8 +1,7 @@
 """The engines of clusters, each with a lost worker: Ray with two nodes on this host, and a real Slurm if one runs here.
 
 `make batch-engines` installs what they need; without it they are skipped. Slurm: `tests/slurm_here.sh FOLDER` starts
-one as root, and SLURM_CONF names it.
-"""
+one as root, and SLURM_CONF names it."""
 
 import os
 import shutil

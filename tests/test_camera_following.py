@@ -1,5 +1,6 @@
-"""`mien drive --by camera`: a drawn head in a video that plays as a camera, and avatars that follow it."""
+"""`mien drive --by camera`: names of cameras, cameras that are read while they film, and avatars that follow."""
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -9,17 +10,20 @@ import numpy as np
 import pytest
 import torch
 
+from known import known
 from mien import runtime
 from mien.capture.person.faces import LandmarkDetector
 from mien.cli import main
 from mien.driving.live.follower import Follower, FollowOptions
 from mien.driving.live.landmark_fit import LandmarkFit
 from mien.driving.live.one_euro import OneEuro
+from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.synthetic import RECIPES
 from mien.lab.synthetic.recipe import Segment
 from mien.lab.synthetic.scene import SyntheticScene
-from mien.media.camera_names import camera_named
+from mien.media.camera_names import CameraName, camera_named, is_camera
+from mien.media.live_camera import LiveCamera
 from mien.media.video import probe_video, read_video_frames, write_video
 from mien.pipeline import view_motions as viewing_motions
 from mien.rotation import matrix_from_axis_angle
@@ -28,8 +32,8 @@ from mien.viewer.drawing import View
 from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
 from mien.viewer.session import Seen, Session
-from test_live_camera import FPS, Stage, until
-from web_case import drawn_head
+from refusals import complaint, refuses
+from web_case import drawn_head, until
 
 STILL_SECONDS, SECONDS = 1.4, 4.6
 SIZE = 320
@@ -98,8 +102,7 @@ def test_one_euro_is_still_at_rest_and_quick_in_motion() -> None:
 def test_an_avatar_learns_follows_without_lag_and_goes_to_rest(clip: Path, landmarks, course: Course) -> None:
     one, ((state, rest), *after) = course
     expressions = np.load(clip.with_name("expressions.npy"))
-    assert state == "waiting"
-    assert {state for state, _ in after[:22]} == {"learning"}
+    assert (state, {state for state, _ in after[:22]}) == ("waiting", {"learning"})
     assert {state for state, _ in after[30:]} == {"following"}
     faces = [face for _, face in after]
     for face in faces[:22]:
@@ -279,5 +282,108 @@ def test_what_the_command_refuses(tmp_path: Path, capsys) -> None:
         (["--by", f"camera:{clip}", "--port", "99999"], "--port 99999"),
         (["--by", str(clip), "--camera-format", "v4l2", "--out", "a.mp4"], "--camera-format"),
     ):
-        assert main(["drive", str(avatar), *options]) == 2
-        assert message in capsys.readouterr().err
+        assert message in complaint(capsys, "drive", str(avatar), *options)
+
+
+FPS = 25
+
+
+class Stage:
+    """A clock for a camera: each wait between frames lasts until the test lets it go on, and then as long as asked."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.waits: list[float] = []
+        self.begins: Callable[[], bool] = lambda: True
+        """Whether the first frame may come."""
+        self.turns = threading.Semaphore(0)
+
+    def wait(self, stopping: threading.Event, seconds: float) -> None:
+        if not self.waits:
+            until(self.begins)
+        elif seconds and not stopping.is_set():
+            assert self.turns.acquire(timeout=60)
+        self.waits.append(seconds)
+        self.now += seconds
+
+    def camera(self, name: CameraName, again: bool, say: Callable[[str], None] = lambda text: None) -> LiveCamera:
+        return LiveCamera(name, again, say, lambda: self.now, self.wait)
+
+
+def test_names_of_cameras_and_devices_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("camera", "camera:/dev/video7", "camera.mp4", "out/camera")
+    assert [is_camera(name) for name in names] == [True, True, False, False]
+    clip = tmp_path / "clip.mp4"
+    clip.write_bytes(b"x")
+    assert camera_named(f"camera:{clip}", None).is_file
+    assert camera_named("camera:rtsp://host/live", None).is_stream
+    assert camera_named("camera:0", "avfoundation") == CameraName("0", "avfoundation")
+    for name, words in (("", "names no camera"), (str(tmp_path), "is a folder")):
+        refuses(words, camera_named, f"camera:{name}", None)
+    with pytest.raises(UserError, match="there is no /dev/video99.*camera:clip.mp4|there is no /dev/video99.*these"):
+        camera_named("camera:/dev/video99", "v4l2")
+    monkeypatch.setattr("mien.media.camera_names.DEVICES", tmp_path)
+    for name in ("video10", "video2", "null"):
+        (tmp_path / name).touch()
+    refuses(f"one of these: {tmp_path}/video2, {tmp_path}/video10$", camera_named, "camera:/dev/video99", "v4l2")
+    no_camera = LiveCamera(camera_named("camera:/dev/null", "v4l2"), False)
+    with pytest.raises(UserError, match="camera:/dev/null: cannot be opened"), no_camera:
+        pass
+
+
+def test_a_file_plays_in_real_time_and_only_the_newest_frame_is_kept(tmp_path: Path) -> None:
+    stage, every, clip = Stage(), 40, tmp_path / "clip.mp4"
+    write_video(clip, [np.zeros((32, 48, 3), np.uint8)] * every, FPS)
+    with stage.camera(camera_named(f"camera:{clip}", None), again=False) as camera:
+        camera.start()
+        first = known(camera.newest(-1, 120.0))
+        assert (first.number, first.seconds, first.picture.shape) == (0, 100.0, (32, 48, 3))
+        stage.turns.release(10)
+        until(lambda: camera.frames == 11)
+        later = known(camera.newest(first.number, 120.0))
+        assert (later.number, later.seconds) == (10, pytest.approx(100.4))
+        assert camera.newest(later.number + 1000, 0.01) is None
+        assert stage.waits[1:] == pytest.approx([1 / FPS] * 10)
+        until(lambda: len(stage.waits) == 11)  # it waits for the next turn
+        stage.now += 0.5  # a reader that is slow
+        stage.turns.release(every)
+        until(lambda: camera.ended)
+        assert camera.frames == every
+        assert camera.error is None
+    assert stage.waits[12:24] == [0] * 12, "it catches up with the clock"
+    assert stage.waits[25:] == pytest.approx([1 / FPS] * (every - 25))
+
+
+def test_a_camera_that_vanishes_is_taken_up_again(tmp_path: Path) -> None:
+    """A stream that ends counts as a camera that vanished. Here it is a file that is taken for a stream."""
+    short, away = tmp_path / "short.mp4", tmp_path / "away.mp4"
+    write_video(short, [np.zeros((32, 32, 3), np.uint8)] * 5, FPS)
+    said: list[str] = []
+    waits: list[tuple[float, int, int]] = []
+
+    def wait(stopping: threading.Event, seconds: float) -> None:
+        waits.append((seconds, camera.frames, len(said)))
+        if len(waits) == 1:
+            short.rename(away)
+        elif len(waits) == 4:
+            away.rename(short)
+        elif len(waits) == 5:
+            stopping.wait(120)
+
+    camera = LiveCamera(_Stream(str(short), "v4l2"), True, said.append, wait=wait)
+    with camera:
+        camera.start()
+        until(lambda: len(waits) == 5)
+        assert waits == [(1.0, 5, 1)] * 4 + [(1.0, 10, 3)], "it is said once"
+        assert "waits until it is back" in said[0]
+        assert "is back" in said[1]
+        assert camera.is_lost
+    assert not any(thread.name == "mien-camera" for thread in threading.enumerate())
+    assert camera.error is None
+
+
+class _Stream(CameraName):
+    """A file that is read as fast as it can, as if it were a stream."""
+
+    is_stream = property(lambda self: True)
+    is_file = property(lambda self: False)

@@ -21,6 +21,7 @@ from mien.capture.from_video import capture_video_parts
 from mien.capture.settings import CaptureSettings
 from mien.errors import UserError
 from mien.media.video import write_video
+from refusals import refuses
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +68,7 @@ def test_a_damaged_capture_is_captured_again(face_clip, tmp_path, capsys):
     before = tree_bytes(tmp_path)
     file = tmp_path / "wandering/capture/frames/0/000003.png"
     file.write_bytes(file.read_bytes()[:-30])
-    with pytest.raises(UserError, match="`mien capture`"):
-        read_capture(tmp_path / "wandering" / "capture")
+    refuses("`mien capture`", read_capture, tmp_path / "wandering" / "capture")
     (mended,) = capture_video_parts(face_clip, tmp_path, settings)
     assert f"{file}: " in (said := capsys.readouterr().err)
     assert "it is captured again" in said
@@ -81,7 +81,6 @@ def test_a_clip_is_trimmed_and_other_settings_replace_the_capture(face_clip, tmp
     capture = capture_video(face_clip, out, CaptureSettings(size=64, start=0.08, end=0.32))
     assert capture.source["first_frame"] == 2
     np.testing.assert_allclose(capture.timestamps, np.arange(6) / 25, atol=1e-6)
-
     capture = capture_video(face_clip, out, CaptureSettings(size=96, max_frames=2, stride=3, start=0.04))
     assert capture.images.shape[:3] == (2, 1, 96)
     np.testing.assert_allclose(capture.timestamps, [0, 0.12], atol=1e-6)
@@ -95,10 +94,8 @@ def test_interrupted_capture_goes_on_to_the_same_bytes(face_clip, tmp_path, monk
     capture_video(face_clip, tmp_path / "straight" / "capture", settings)
     out = tmp_path / "interrupted" / "capture"
     calls = interrupt_at(2, monkeypatch, process.PartProcessor, "process")
-    with pytest.raises(KeyboardInterrupt):
-        capture_video(face_clip, out, settings)
-    with pytest.raises(UserError, match="no capture there"):
-        read_capture(out)
+    pytest.raises(KeyboardInterrupt, capture_video, face_clip, out, settings)
+    refuses("no capture there", read_capture, out)
     capture_video(face_clip, out, settings)
     assert [start for _, start, *_ in calls] == [0, 3, 3]
     assert tree_bytes(out) == tree_bytes(tmp_path / "straight" / "capture")
@@ -113,17 +110,14 @@ def test_folder_of_images_in_natural_order(test_data, tmp_path):
         picture[:8, :8] = number
         cv2.imwrite(str(folder / f"{number}.png"), picture[..., ::-1])
     capture = capture_video(folder, tmp_path / "capture", CaptureSettings(fps=10.0, crop="none"))
-    assert capture.name == "pictures"
-    assert capture.images[:, 0, 0, 0, 0].tolist() == [1, 2, 10]
+    assert (capture.name, capture.images[:, 0, 0, 0, 0].tolist()) == ("pictures", [1, 2, 10])
     assert capture.valid[:, 0].tolist() == np.isfinite(capture.landmarks[:, 0, 0, 0]).tolist() == [True, False, True]
     np.testing.assert_allclose(capture.timestamps, [0, 0.1, 0.2])
     assert capture.images.shape[2:4] == (128, 128)  # not enlarged
     cv2.imwrite(str(folder / "3.png"), face[:100])
-    with pytest.raises(UserError, match="3.png: is 128x100"):
-        capture_video(folder, tmp_path / "other")
+    refuses("3.png: is 128x100", capture_video, folder, tmp_path / "other")
     (folder / "3.png").write_bytes(b"no image")
-    with pytest.raises(UserError, match="3.png: cannot be read as an image"):
-        capture_video(folder, tmp_path / "other")
+    refuses("3.png: cannot be read as an image", capture_video, folder, tmp_path / "other")
 
 
 @pytest.mark.parametrize(("turn", "lies"), [(90, "on its side"), (180, "upside down"), (270, "on its side")])
@@ -150,9 +144,8 @@ def test_nobody_there_is_said_and_why(tmp_path):
         (128, 5, "no face found in any of its 5 frames"),
     ):
         write_video(path, [np.full((120, 160, 3), level, np.uint8)] * frames, 25)
-        with pytest.raises(UserError, match=remedy) as error:
-            capture_video(path, tmp_path / "capture")
-        assert str(path) in str(error.value)
+        error = refuses(remedy, capture_video, path, tmp_path / "capture")
+        assert str(path) in error
         assert not (tmp_path / "capture").exists()
 
 
@@ -172,9 +165,7 @@ def test_bad_requests_are_refused(face_clip, tmp_path):
         (face_clip, "out", CaptureSettings(start=0.08, end=0.04), "--capture.end 0.04: give a time after"),
         (face_clip, "out", CaptureSettings(stride=0), "--capture.stride 0: give 1 for every frame"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=message) as error:
-            capture_video(tmp_path / source, tmp_path / out, settings)
-        assert "\n" not in str(error.value)
+        refuses(message, capture_video, tmp_path / source, tmp_path / out, settings)
 
 
 @pytest.mark.unchecked

@@ -1,24 +1,31 @@
 """Crops, mattes and jitter, what comes with a video, and reports of blur, darkness, over-exposure and casts."""
 
 import itertools
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
 import pytest
 
 from capture_helpers import face_picture, light_of
-from mien.capture.from_video import capture_video_parts
+from mien.capture.from_video import capture_video_parts, open_job
+from mien.capture.person import backend
 from mien.capture.person.crop import choose_crop, whole_picture
-from mien.capture.person.faces import LandmarkDetector, second_difference_jitter
+from mien.capture.person.faces import FaceFinder, LandmarkDetector, MeshReader, second_difference_jitter
 from mien.capture.person.given import read_landmarks
-from mien.capture.person.matte import refine_matte
+from mien.capture.person.litert.mesh import Mesh
+from mien.capture.person.matte import Segmenter, refine_matte
 from mien.capture.person.plate import plate_matte
 from mien.capture.quality import measure_face, quality_report, relative_quality
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import write_arrays
 from mien.errors import UserError
+from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.media.picture_files import write_png
 from mien.media.tone import srgb_signal
-from mien.media.video import read_lazily, write_video
+from mien.media.video import read_lazily, read_video_frames, write_video
+from refusals import refuses
 
 
 def boxed(center_x: float, center_y: float, side: float, width: int, height: int) -> np.ndarray:
@@ -62,7 +69,7 @@ def test_jitter_is_the_second_difference():
     assert np.isnan(second_difference_jitter(steady[:2]))
 
 
-def test_matte_has_its_border_on_the_edge_of_the_picture():
+def test_mattes_have_their_border_on_the_edge_of_the_picture_and_of_what_is_new():
     """A matte ends at the picture's edge, although the mask is soft and 3 pixels off, as from a 256x256 network."""
     picture = np.full((512, 512, 3), 50, np.uint8)
     picture[:, 260:] = (200, 150, 130)
@@ -73,9 +80,6 @@ def test_matte_has_its_border_on_the_edge_of_the_picture():
     assert np.abs(alpha - truth).sum() < 0.4 * np.abs(soft - truth).sum()
     assert (alpha[:235] == 0).all()
     assert (alpha[285:] == 1).all()
-
-
-def test_clean_plate_cuts_on_the_border_of_what_is_new():
     plate = np.random.default_rng(0).integers(60, 200, (160, 160, 3)).astype(np.uint8)
     plate = cv2.GaussianBlur(plate, (0, 0), 3)
     truth = cv2.ellipse(np.zeros((160, 160), np.uint8), (80, 90), (36, 50), 0, 0, 360, 255, -1)
@@ -100,18 +104,19 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
     points = np.random.default_rng(0).uniform(40, 120, (3, 478, 2)).astype(np.float32)
     points[1] = np.nan
     write_arrays(tmp_path / "points.safetensors", {"landmarks": points})
-    np.savetxt(tmp_path / "points.csv", points.reshape(3, -1), "%.6f", ",")
-    np.testing.assert_allclose(read_landmarks(tmp_path / "points.csv", 3), points, atol=1e-5)
+    for separator, point, encoding in (("\t", ".", "utf-16"), (";", ",", "utf-8-sig"), (",", ".", "utf-8")):
+        rows = ["" if np.isnan(row).any() else separator.join(f"{value:.6f}" for value in row.flat) for row in points]
+        text = "x0" + separator + "y0\n" + "\n".join(rows).replace(".", point) + "\n"
+        (tmp_path / "points.csv").write_text(text, encoding)
+        np.testing.assert_allclose(read_landmarks(tmp_path / "points.csv", 3), points, atol=1e-5)
     settings = CaptureSettings(crop="none", mattes=mattes, landmarks=tmp_path / "points.safetensors")
     (capture,) = capture_video_parts(clip, tmp_path / "sequences", settings)
     np.testing.assert_allclose(capture.landmarks[:, 0], points, atol=1e-4)
     assert capture.valid[:, 0].tolist() == [True, False, True]
     assert (capture.mattes == matte).all()
     (mattes / "2.png").unlink()
-    with pytest.raises(UserError, match="has 2 mattes, .* has 3 frames"):
-        capture_video_parts(clip, tmp_path / "other", settings)
-    with pytest.raises(UserError, match=r"expected \[4, 478, 2\]"):
-        read_landmarks(tmp_path / "points.csv", 4)
+    refuses("has 2 mattes, .* has 3 frames", capture_video_parts, clip, tmp_path / "other", settings)
+    refuses(r"expected \[4, 478, 2\]", read_landmarks, tmp_path / "points.csv", 4)
     cv2.imwrite(str(tmp_path / "plate.png"), matte[:100])
     with pytest.raises(UserError, match="plate.png: is 160x100, but the video's pictures are 160x160"):
         capture_video_parts(clip, tmp_path / "other", CaptureSettings(clean_plate=tmp_path / "plate.png"))
@@ -139,8 +144,7 @@ def test_mattes_may_be_a_video(test_data, tmp_path):
         (320, 4, "has 4 mattes, .* has 5 frames"),
     ):
         write_video(mattes, [np.zeros((side, side, 3), np.uint8)] * count, 25.0)
-        with pytest.raises(UserError, match=refusal):
-            capture_video_parts(clip, tmp_path / "other", settings)
+        refuses(refusal, capture_video_parts, clip, tmp_path / "other", settings)
 
 
 @pytest.mark.unchecked
@@ -228,3 +232,80 @@ def test_casts_and_darkness_of_real_clips(test_data, clip):
     with LandmarkDetector(False) as detector:
         for frame in itertools.islice(read_lazily(test_data / "footage" / f"{clip}.mp4"), 0, 80, 40):
             check_light(frame.picture(), detector.detect(frame.picture())[0])
+
+
+pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
+
+
+@pytest.fixture(scope="module")
+def drawn() -> np.ndarray:
+    recipe = SyntheticRecipe(width=256, height=256, seconds=0.2, fps=10.0, supersample=1, texture_size=256)
+    return SyntheticScene(recipe, 2).frame(0).image
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the mean distance of landmarks, in distances between the eyes' outer corners."""
+    eyes = np.linalg.norm(one[33] - one[263])
+    return float(np.linalg.norm(one - other, axis=-1).mean() / eyes)
+
+
+def test_landmarks_and_mattes_are_those_of_mediapipe_on_a_drawn_face(drawn):
+    with LandmarkDetector(False, "mediapipe") as own, LandmarkDetector(False, "litert") as other:
+        assert apart(own.detect(drawn)[0], other.detect(drawn)[0]) < 0.03
+    with MeshReader(1, False, "mediapipe") as own, MeshReader(1, False, "litert") as other:
+        deep, also = own.read(drawn)[0, :, 2], other.read(drawn)[0, :, 2]
+    assert np.corrcoef(deep, also)[0, 1] > 0.98
+    with Segmenter("mediapipe") as own, Segmenter("litert") as other:
+        assert np.abs(own.segment(drawn) - other.segment(drawn)).mean() < 0.01
+
+
+@pytest.mark.parametrize("clip", ["d3", "d6", "d9", "d14", "d18", "s18", "wojtek"])
+def test_landmarks_are_those_of_mediapipe_on_real_clips(test_data, clip):
+    frames = [image for _, image in itertools.islice(read_video_frames(test_data / "footage" / f"{clip}.mp4"), 4)]
+    with LandmarkDetector(False, "mediapipe") as own, LandmarkDetector(False, "litert") as other:
+        pairs = [(own.detect(image), other.detect(image)) for image in frames]
+    assert all(len(one) == len(two) == 1 for one, two in pairs)
+    assert np.mean([apart(one[0], two[0]) for one, two in pairs[2:]]) < 0.03
+
+
+@pytest.mark.parametrize("side", [256, 96])
+def test_boxes_are_those_of_mediapipe_near_and_far(drawn, side):
+    """A face that is a small part of the picture is found by the network for far faces alone."""
+    wide = np.full((360, 640, 3), 150, np.uint8)
+    wide[40 : 40 + side, 60 : 60 + side] = cv2.resize(drawn, (side, side), interpolation=cv2.INTER_AREA)
+    with FaceFinder("mediapipe") as own, FaceFinder("litert") as other:
+        one, two = own.find(wide), other.find(wide)
+        assert len(one) == len(two) == 1
+        assert np.abs(one - two).max() < 0.05 * (one[0, 2] - one[0, 0])
+        assert own.surest(wide) == pytest.approx(other.surest(wide), abs=0.05)
+
+
+def test_two_faces_are_followed_none_is_found_in_nothing_and_landmarks_turn_with_the_picture(drawn):
+    beside = np.concatenate([drawn, drawn[:, ::-1]], axis=1)
+    mesh = Mesh(4, follows=True)
+    found = [mesh.find(np.ascontiguousarray(beside)) for _ in range(3)][-1]
+    assert sorted(found[:, 1, 0] > 256) == [False, True]
+    found = [mesh.find(np.zeros((100, 80, 3), np.uint8)) for _ in range(2)][-1]
+    assert found.shape == (0, 478, 3)
+    # The square that the network sees follows the face, also when the head lies on a shoulder.
+    turned = np.ascontiguousarray(np.rot90(drawn))
+    with LandmarkDetector(False, "litert") as upright, LandmarkDetector(False, "litert") as lying:
+        one, two = [(upright.detect(drawn), lying.detect(turned)) for _ in range(3)][-1]
+    assert apart(one[0], np.column_stack([256 - two[0, :, 1], two[0, :, 0]])) < 0.02
+
+
+def test_litert_serves_where_mediapipe_is_missing_and_its_captures_are_others(drawn, tmp_path, monkeypatch):
+    """Keys of captures by mediapipe are those from before the setting; by litert they differ."""
+    write_png(tmp_path / "0.png", drawn)
+    jobs = {
+        choice: open_job(tmp_path, CaptureSettings(detector=choice), None, False)
+        for choice in ("auto", "mediapipe", "litert")
+    }
+    assert jobs["auto"].key == jobs["mediapipe"].key != jobs["litert"].key
+    entries = [backend.detector_of(backend.detector_entry(job.detector)) for job in jobs.values()]
+    assert entries == ["mediapipe", "mediapipe", "litert"]
+    assert backend.choose_detector() == "mediapipe"
+    monkeypatch.setattr(backend, "find_spec", lambda name: None if name == "mediapipe" else find_spec(name))
+    assert backend.choose_detector() == "litert"
+    with pytest.raises(ModuleNotFoundError, match="mediapipe"):
+        backend.choose_detector("mediapipe")

@@ -14,7 +14,6 @@ from mien.avatar.density import GradientDensity
 from mien.avatar.methods import METHODS
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import Photometric
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render import rasterize
@@ -35,8 +34,8 @@ from mien.training.footage.frames import training_frames
 from mien.training.footage.sequence import Sequence
 from mien.training.whole_head.unseen import UNSEEN_CONFIDENCE, Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of, toy_face, toy_sequence
+from refusals import refuses
+from toy_scene import rgb_from_sh, surface_of, toy_face, toy_sequence
 
 Toy = tuple[FaceModel, Sequence]
 SETTINGS = plain_run(steps=6, split="none", unseen="filled", checkpoint_every=3, record_every=1)
@@ -62,7 +61,7 @@ def facing(model: FaceModel) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)[:, 2]
 
 
-def test_the_front_is_seen_and_the_back_is_not(toy: Toy) -> None:
+def test_the_front_is_seen_and_not_the_back_nor_what_is_cut_off(toy: Toy) -> None:
     model, sequence = toy
     found, front = covered(toy), facing(model)
     assert (found.seen[front > 0.7] > 0.95).all()
@@ -80,9 +79,6 @@ def test_the_front_is_seen_and_the_back_is_not(toy: Toy) -> None:
     mouth = replace(model, region_names=("skin", "mouth"), face_regions=regions)
     drawn = torch.where(regions == 1, 1.0, found.seen)
     assert torch.equal(drawn_share(mouth, found), drawn), "the inside of the mouth is always drawn"
-
-
-def test_what_the_mask_or_the_neck_line_cuts_off_is_not_seen(toy: Toy) -> None:
     model, sequence = toy
     assert not covered((model, replace(sequence, scoring=np.zeros_like(sequence.scoring)))).seen.any()
     assert (covered(toy).above == 1).all()
@@ -93,7 +89,7 @@ def test_what_the_mask_or_the_neck_line_cuts_off_is_not_seen(toy: Toy) -> None:
     assert (above[heights < -0.04] == 0).all()
 
 
-def test_a_triangle_behind_another_is_hidden(toy: Toy) -> None:
+def test_what_is_behind_is_hidden_and_high_hair_is_drawn_where_the_mesh_is_not(toy: Toy) -> None:
     """A second head inside of the first faces the camera as well, and is never seen."""
     model, sequence = toy
     v, half = len(model.template), len(model.faces)
@@ -106,6 +102,18 @@ def test_a_triangle_behind_another_is_hidden(toy: Toy) -> None:
     seen = covered((twice, sequence)).seen
     assert (seen[:half][facing(model) > 0.8] > 0.9).all()
     assert not seen[half:].any()
+    # High hair on the back of a head stands out beside the face. Nothing is drawn outside of the head's mask.
+    model, sequence = toy
+    behind = facing(model) < -0.2
+
+    def drawn(height: float, given: Sequence) -> torch.Tensor:
+        above = torch.where(behind, height, 0.0)
+        return drawn_at_height(model, above, [given], [given.tracking.face], training_frames([given], SETTINGS))
+
+    assert drawn(0.0, sequence)[facing(model) > 0.7].all()
+    assert not drawn(0.0, sequence)[behind].any()
+    assert drawn(0.05, sequence)[behind].any()
+    assert not drawn(0.05, replace(sequence, scoring=np.zeros_like(sequence.scoring))).any()
 
 
 def measured(toy: Toy, avatar: Avatar) -> Unseen:
@@ -114,7 +122,7 @@ def measured(toy: Toy, avatar: Avatar) -> Unseen:
     return unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
 
 
-def test_only_what_is_seen_is_trained(toy: Toy) -> None:
+def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     """Fills have no gradients but those that move them along their normal."""
     sequence, avatar = toy[1], bare_avatar(toy)
     unseen, store = measured(toy, avatar), avatar.gaussian_store()
@@ -135,10 +143,7 @@ def test_only_what_is_seen_is_trained(toy: Toy) -> None:
     moved = known(store["means"].grad)[filled_in]
     assert moved[:, 1].any()
     assert not moved[:, [0, 2]].any()
-
-
-def test_features_of_fills_are_not_trained(toy: Toy) -> None:
-    """Their bases have a gradient of their own kind, which is masked like the others."""
+    # Their bases have a gradient of their own kind, which is masked like the others.
     model, sequence = toy
     config = plain_gaussian_avatars(appearance="features", appearance_directions=2, appearance_features=3)
     avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
@@ -179,21 +184,6 @@ def test_what_is_beside_shown_triangles_is_trained(toy: Toy, monkeypatch: pytest
     further = filled(0.03)
     assert not further[drawn].any(), "hair that the mesh shows at its height is trained, and so is a band around it"
     assert not further[~behind].any()
-
-
-def test_high_hair_is_drawn_where_the_mesh_is_not(toy: Toy) -> None:
-    """High hair on the back of a head stands out beside the face. Nothing is drawn outside of the head's mask."""
-    model, sequence = toy
-    behind = facing(model) < -0.2
-
-    def drawn(height: float, given: Sequence) -> torch.Tensor:
-        above = torch.where(behind, height, 0.0)
-        return drawn_at_height(model, above, [given], [given.tracking.face], training_frames([given], SETTINGS))
-
-    assert drawn(0.0, sequence)[facing(model) > 0.7].all()
-    assert not drawn(0.0, sequence)[behind].any()
-    assert drawn(0.05, sequence)[behind].any()
-    assert not drawn(0.05, replace(sequence, scoring=np.zeros_like(sequence.scoring))).any()
 
 
 def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
@@ -285,8 +275,7 @@ def test_damaged_coverage_is_named(toy: Toy, tmp_path: Path) -> None:
     write_coverage(tmp_path, found)
     assert torch.equal(known(read_coverage(tmp_path, toy[0])).colors, found.colors)
     write_coverage(tmp_path, replace(found, seen=found.seen + 1))
-    with pytest.raises(UserError, match=FILE):
-        read_coverage(tmp_path, toy[0])
+    refuses(FILE, read_coverage, tmp_path, toy[0])
 
 
 def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
@@ -307,9 +296,7 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     zeros, angles = np.zeros(1, np.float32), np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32)
     filmed, degrees = Filmed(zeros, zeros, zeros[:, None], zeros, angles), np.degrees(angles)
     for coverage, expected in (
-        (left, [[degrees[0, 0], 60], [-30, 30]]),
-        (everything, [[-60, 60], [-30, 30]]),
-        (nothing, degrees),
-    ):
+        (left, [[degrees[0, 0], 60], [-30, 30]]), (everything, [[-60, 60], [-30, 30]]), (nothing, degrees),
+    ):  # fmt: skip
         found = np.degrees(with_shown_angles(filmed, model, vertices, coverage).head_angles)
         np.testing.assert_allclose(found, expected, atol=1e-4)

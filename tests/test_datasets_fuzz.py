@@ -1,8 +1,7 @@
 """Random faults in every layout of a dataset: one line of complaint, or content that can be used.
 
 `make fuzz-datasets` makes 2,000 in each layout. Nothing outside the output may change, and no pickle may run. Some are
-damage to a file of any kind; others have a meaning: a missing camera, another FLAME (`fuzzing.dataset_faults`).
-"""
+damage to a file of any kind; others have a meaning: a missing camera, another FLAME (`fuzzing.dataset_faults`)."""
 
 import os
 from pathlib import Path

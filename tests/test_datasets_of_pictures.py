@@ -24,6 +24,7 @@ from mien.pipeline import import_dataset as import_footage
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.training.splits.own import OwnSplit
+from refusals import refuses
 
 
 @pytest.fixture
@@ -119,8 +120,7 @@ def test_poses_and_coefficients_of_an_unpublished_head_become_a_tracking(scene: 
     for index, frame in enumerate(content["frames"]):
         frame["transform_matrix"][0][3] += (-1) ** index * 1.5  # no place of the head fits places that jump by 40 cm
     file.write_text(json.dumps(content))
-    with pytest.raises(UserError, match="by its poses, landmarks are"):
-        checks.read(folder, "nerf-blendshape", model)
+    refuses("by its poses, landmarks are", checks.read, folder, "nerf-blendshape", model)
 
 
 def test_benchmark_of_one_camera(scene: Scene, tmp_path: Path) -> None:
@@ -145,8 +145,7 @@ def test_benchmark_of_one_camera(scene: Scene, tmp_path: Path) -> None:
     file = place / "tracking/flame2023_tracking_v2.npz"
     arrays = dict(np.load(file))
     file.write_bytes(writers.npz({**arrays, "rotation": arrays["rotation"][:, ::-1]}))
-    with pytest.raises(UserError, match="'rotation' and 'rotation_matrices' differ"):
-        checks.read(folder, "nersemble-benchmark", scene.model)
+    refuses("'rotation' and 'rotation_matrices' differ", checks.read, folder, "nersemble-benchmark", scene.model)
 
 
 def test_benchmark_of_novel_views(scene: Scene, tmp_path: Path) -> None:
@@ -195,8 +194,7 @@ def test_nersemble_is_captured_with_its_cameras_and_clean_plates(tmp_path: Path,
     video.unlink()
     video.symlink_to(video)
     assert checks.surveyed(folder).clips == (Clip("EMO-1-shout+laugh", 3, 2),)
-    with pytest.raises(UserError, match=r"cam_222200036.mp4: is missing, or no file"):
-        checks.read(folder, "nersemble")
+    refuses(r"cam_222200036.mp4: is missing, or no file", checks.read, folder, "nersemble")
 
 
 def test_a_benchmark_person_without_its_mattes_is_no_raw_recording(scene: Scene, tmp_path: Path) -> None:
@@ -209,15 +207,13 @@ def test_a_benchmark_person_without_its_mattes_is_no_raw_recording(scene: Scene,
     for target in (folder / "nothing", folder / "calibration/camera_params.json"):
         mattes.symlink_to(target)
         assert [each.name for each in datasets() if each.recognises(folder)] == ["nersemble-benchmark"]
-        with pytest.raises(UserError, match="is missing, the mattes of cam_222200037.mp4"):
-            checks.read(folder, "nersemble-benchmark")
+        refuses("is missing, the mattes of cam_222200037.mp4", checks.read, folder, "nersemble-benchmark")
         mattes.unlink()
     for video in (folder / "sequences/EXP-2-eyes/images").iterdir():
         video.unlink()
         video.symlink_to(video)
     mattes.mkdir()
-    with pytest.raises(UserError, match="images: none of its videos"):
-        checks.read(folder, "nersemble-benchmark")
+    refuses("images: none of its videos", checks.read, folder, "nersemble-benchmark")
 
 
 def test_a_take_of_live_link_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,8 +226,7 @@ def test_a_take_of_live_link_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     import_footage.write_footage(tmp_path / "out", footage, find_dataset("live-link-face"), folder)
     assert (tmp_path / "out/driving.csv").is_file()
     (folder / "Me_3_iPhone_cal.csv").write_text("Timecode,BlendshapeCount,EyeBlinkLeft\nnothing\n")
-    with pytest.raises(UserError):
-        checks.read(folder, "live-link-face")
+    pytest.raises(UserError, checks.read, folder, "live-link-face")
 
 
 def test_insta_without_checkpoints_is_pictures(scene: Scene, tmp_path: Path) -> None:
@@ -241,5 +236,4 @@ def test_insta_without_checkpoints_is_pictures(scene: Scene, tmp_path: Path) -> 
     view = np.linalg.inv(sequence.foreign["camera_to_head"][1])
     assert np.abs(view[:3, :3] - head_view(1)[0]).max() < 1e-6
     shutil.rmtree(folder / "images")
-    with pytest.raises(UserError, match=r"images/00000.png: is missing"):
-        checks.read(folder, "insta")
+    refuses(r"images/00000.png: is missing", checks.read, folder, "insta")

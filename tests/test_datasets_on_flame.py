@@ -17,12 +17,12 @@ from mien.datasets import insta, matting, overlay, sequences
 from mien.datasets.pictures import read_picture
 from mien.datasets.registry import find_dataset
 from mien.datasets.writing import write_sequence
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.models import teeth
 from mien.face.models.flame import flame_face_model, read_flame
 from mien.training.footage.clothes import clothes_mask
 from mien.training.splits.own import OwnSplit
+from refusals import refuses
 
 CHECKED = ("insta", "imavatar", "vhap, one camera")
 """One layout of each importer, whose calls are checked."""
@@ -38,8 +38,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
 
 
 def refused(folder: Path, scene: Scene, words: str, name: str = "insta") -> None:
-    with pytest.raises(UserError, match=words):
-        checks.read(folder, name, scene.model)
+    refuses(words, checks.read, folder, name, scene.model)
 
 
 def check_retracked(folder: Path, name: str, scene: Scene) -> None:
@@ -78,15 +77,11 @@ def test_imavatar_keeps_the_masks_of_clothes(scene: Scene, tmp_path: Path) -> No
     assert not checks.read(folder, "imavatar", scene.model)[0].foreign
 
 
-def test_without_flame_the_remedy_is_told(scene: Scene, anny: FaceModel, tmp_path: Path) -> None:
+def test_what_lacks_flame_or_fits_no_pictures_is_refused_with_a_remedy(scene: Scene, anny: FaceModel, tmp_path) -> None:
     folder = writers.write_insta(tmp_path / "me", scene)
     assert checks.surveyed(folder).face_model == "FLAME 2020"
     for model in (None, anny):
-        with pytest.raises(UserError, match=r"its tracking needs FLAME 2020 \(generic_model.pkl\)"):
-            checks.read(folder, "insta", model)
-
-
-def test_a_tracking_that_does_not_fit_its_pictures_is_refused(scene: Scene, tmp_path: Path) -> None:
+        refuses(r"its tracking needs FLAME 2020 \(generic_model.pkl\)", checks.read, folder, "insta", model)
     folder = writers.write_insta(tmp_path / "me", scene)
     for number in range(7):
         frame = writers.tracker_frame(scene, min(number, 5), writers.OFF_CENTRE)
@@ -154,8 +149,7 @@ def test_a_picture_without_opacity_or_mask_is_a_damaged_copy(scene: Scene, tmp_p
         writers.write_picture(file, read_picture(file)[0][:-1], np.full((255, 256), 255, np.uint8))
     words = "have 256x255 pixels, which is no whole multiple of the 128x128 that were"
     refused(folder, scene, words)
-    with pytest.raises(UserError, match=words):
-        checks.read_pictures(folder)
+    refuses(words, checks.read_pictures, folder)
     impossible = "'img_size' is not the height and width of a picture"
     for sizes, words in (
         (([SIDE, SIDE], [SIDE, 2 * SIDE]), "'img_size' is not the same in all checkpoints"),
@@ -192,9 +186,6 @@ def test_the_last_frames_are_held_out(scene: Scene, tmp_path: Path, monkeypatch:
         monkeypatch.setitem(insta.TEST_FRAMES, kind, 6)
         assert checks.surveyed(folder).split is None
         assert any("6 frames are too few for" in each for each in checks.surveyed(folder).missing)
-
-
-# VHAP -----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.unchecked

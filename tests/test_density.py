@@ -80,7 +80,7 @@ def faces(
     return store["face_index"].tolist()
 
 
-def test_small_ones_duplicate_and_large_ones_split() -> None:
+def test_small_ones_duplicate_and_large_ones_split_by_their_mean_gradient() -> None:
     store = make_store([0.001, 0.001, 0.004, 0.004])
     strategy = control(store)
     strategy.observe(pose(store), rendering([ABOVE, BELOW, ABOVE, BELOW]))
@@ -90,10 +90,7 @@ def test_small_ones_duplicate_and_large_ones_split() -> None:
     assert torch.equal(store["means"][3], store["means"][0])
     torch.testing.assert_close(store["log_scales"][4:].exp(), torch.full((2, 3), 0.004 / 1.6))
     assert not torch.equal(store["means"][4], store["means"][5])
-
-
-def test_gradient_is_the_mean_over_the_steps_that_showed_the_gaussian() -> None:
-    """Also after a checkpoint."""
+    # Also after a checkpoint.
     store = make_store([0.001, 0.001])
     strategy, other = control(store), control(store)
     strategy.observe(pose(store), rendering([ABOVE, ABOVE]))
@@ -142,8 +139,7 @@ def test_rounds_and_resets_happen_at_their_fractions() -> None:
         if strategy.adapt(store, pose(store), Progress(step, 50), random):
             rounds.append(step + 1)
         opacities.append(float(store["opacity_logits"].detach().sigmoid()))
-    assert rounds == [10, 20, 30]
-    assert opacities == pytest.approx([0.5] * 24 + [0.01] * 26)
+    assert (rounds, opacities) == ([10, 20, 30], pytest.approx([0.5] * 24 + [0.01] * 26))
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.002])
@@ -177,8 +173,7 @@ def test_refill_deletes_the_unseen_and_reaches_its_target() -> None:
         strategy.observe(posed, rendering([0.0] * 6))
     assert not strategy.adapt(store, faint, FIRST, random)
     assert strategy.adapt(store, faint, Progress(9, 100), random)
-    assert len(store) == 10
-    assert set(store["face_index"].tolist()) == {1, 4}
+    assert (len(store), set(store["face_index"].tolist())) == (10, {1, 4})
     distance = (store["means"].detach() - 3 * store["face_index"][:, None] - torch.arange(3.0)).abs()
     assert distance[2:].max() <= 0.5
     assert distance[2:].min() > 0

@@ -1,8 +1,7 @@
 """Training works without the native core: on a GPU if there is one, and with the same code in PyTorch on the CPU.
 
 Tensors that are not float32 on a CPU use the plain PyTorch twins of all native operations, and the reference rasterizer
-instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels.
-"""
+instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.gaussians import Gaussians
 from mien.machine.devices import choose_device, like_on
@@ -35,6 +33,7 @@ from mien.training.footage.sequence import Sequence, Targets
 from mien.training.trainer import TrainingData, start, step
 from mien.training.whole_head.hair_surface import HairSurface
 from plain_settings import plain_config, plain_run
+from refusals import refuses
 from shared_things import toy_workspace
 from toy_scene import toy_sequence
 from train_toy import silence, stopped_at
@@ -95,8 +94,7 @@ def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys
     needs = "needs a CUDA GPU and gsplat.*uv pip install"
     for gsplat, words in ((None, needs), (object(), "torch .*nvidia-smi")):
         monkeypatch.setattr(mien.machine.devices, "find_spec", lambda name, gsplat=gsplat: gsplat)
-        with pytest.raises(UserError, match=f"--device cuda: {words}"):
-            choose_device("cuda")
+        refuses(f"--device cuda: {words}", choose_device, "cuda")
     assert choose_device("auto").type == choose_device("cpu").type == "cpu"
     assert "using the processor" in capsys.readouterr().err
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -115,11 +113,17 @@ def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> 
 
 
 @pytest.mark.gpu
-def test_a_gpu_trains_as_the_native_core_does(scene: Scene) -> None:
+def test_a_gpu_trains_as_the_native_core_does_and_its_run_goes_on_without_one(scene: Scene, tmp_path: Path) -> None:
     native, on_gpu = train_some(scene, torch.zeros(())), train_some(scene, like_on("cuda"))
     store = on_gpu.avatar.gaussian_store()
     assert all(store[name].is_cuda for name in store.names())
     assert_alike(on_gpu, native)
+    face_model, sequence = scene
+    often = replace(SETTINGS, device="cuda", checkpoint_every=1)
+    with pytest.raises(KeyboardInterrupt):
+        train([sequence], face_model, train_toy.CONFIG, often, tmp_path, stopped_at(SETTINGS.steps // 2))
+    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), tmp_path, silence)
+    assert load_avatar(tmp_path).gaussian_store()["means"].device.type == "cpu"
 
 
 @pytest.mark.unchecked
@@ -136,16 +140,6 @@ def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.Mo
     store = state.avatar.gaussian_store()
     assert all(store[name].device.type == like.device.type for name in store.names())
     assert all(torch.isfinite(store[name]).all() for name in store.trained)
-
-
-@pytest.mark.gpu
-def test_what_a_gpu_trained_is_loaded_and_resumed_without_one(scene: Scene, tmp_path: Path) -> None:
-    face_model, sequence = scene
-    often = replace(SETTINGS, device="cuda", checkpoint_every=1)
-    with pytest.raises(KeyboardInterrupt):
-        train([sequence], face_model, train_toy.CONFIG, often, tmp_path, stopped_at(SETTINGS.steps // 2))
-    train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), tmp_path, silence)
-    assert load_avatar(tmp_path).gaussian_store()["means"].device.type == "cpu"
 
 
 def pictures(workspace: Path, out: Path, device: str) -> np.ndarray:
@@ -207,8 +201,7 @@ def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch
         if isinstance(moments, FactoredMoments):
             assert moments.second.device.type == "meta"
         else:
-            assert float(moments.step) == 3
-            assert moments.first.device.type == "meta"
+            assert (float(moments.step), moments.first.device.type) == (3, "meta")
 
 
 def _rendered(gaussians: Gaussians, camera: Camera, background: Tensor) -> Rendering:

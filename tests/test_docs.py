@@ -1,4 +1,4 @@
-"""Pages name what exists, docs/api.md names what is stable (public_api.json), and the site shows a living avatar."""
+"""Pages name what exists and what is stable, the site shows a living avatar, and a stranger adds a method."""
 
 import importlib
 import inspect
@@ -15,6 +15,7 @@ from forked import ForkServer
 from mien.avatar.methods import METHODS
 from mien.cli import COMMANDS, main
 from mien.formats.page import write_page
+from toy_package import blocks
 from web_case import browse, drawn_head, served, violations
 
 ROOT = Path(__file__).parent.parent
@@ -26,12 +27,16 @@ _PATH = re.compile(r"(?<![\w./])((?:docs|native|examples|benchmarks|src|tests)/[
 """Pattern of a file that the text names without a link."""
 
 
-def test_files_that_pages_name_exist() -> None:
+def test_files_and_commands_that_pages_name_exist() -> None:
+    targets = set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     missing = []
     for page, text in PROSE.items():
         prose = re.sub(r"^```.*?^```|^ {4,}[^\n]*$", "", text, flags=re.MULTILINE | re.DOTALL)
         prose = re.sub(r"`[^`\n]*[A-Z*{][A-Z*{]+[^`\n]*`", "", prose)  # NAME.py and patterns
         missing += [(page.name, path) for path in _PATH.findall(prose) if not (ROOT / path).exists()]
+        missing += [(page.name, name) for name in re.findall(r"`make ([a-z][a-z0-9-]*)", text) if name not in targets]
+        for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
+            missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
     assert missing == []
 
 
@@ -43,16 +48,6 @@ def test_pictures_are_small_and_described() -> None:
     assert [path.name for path in pictures if path.resolve() not in shown] == [], "a picture that no page shows"
     assert [path.name for path in pictures if path.stat().st_size > 120_000] == []
     assert sum(path.stat().st_size for path in pictures) < 1_000_000
-
-
-def test_commands_that_pages_name_exist() -> None:
-    targets = set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    missing = []
-    for page, text in PROSE.items():
-        missing += [(page.name, name) for name in re.findall(r"`make ([a-z][a-z0-9-]*)", text) if name not in targets]
-        for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
-            missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
-    assert missing == []
 
 
 @pytest.mark.unchecked
@@ -70,8 +65,7 @@ def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> No
 
 API = PROSE[ROOT / "docs" / "api.md"]
 STABLE: dict[str, list[str] | None] = json.loads((ROOT / "tests/public_api.json").read_text(encoding="utf-8"))
-"""Full name -> the parameters of a function, in their order, with "=" after those that may be left out; None for what
-is no function."""
+"""Full name -> the parameters of a function in order, "=" after those that may be left out; None for other things."""
 
 
 def parameters(value: Any) -> list[str] | None:
@@ -143,3 +137,58 @@ def test_the_first_page_is_alive_and_everybody_can_read_it(fork_server: ForkServ
         assert expressions > 40
         for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):
             assert violations(f"{address}/index.html", size, device) == []
+
+
+RECIPE = "Add a method"
+REGISTER = """
+import pytest
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config):
+    import mien.avatar
+    from mien.avatar.methods import METHODS, Method
+
+    mien.avatar.__path__.append({folder!r})
+    METHODS.update({{{line}}})
+"""
+
+
+def follow(folder: Path) -> str:
+    """Write the method's file and a plugin that registers it; return the method's name."""
+    *parts, line = blocks(RECIPE, "python")
+    content = "\n\n".join(parts)
+    place = re.match(r"# (src/mien/avatar/(\w+)\.py)\n", content)
+    assert place is not None, "the first block names the file"
+    (folder / f"{place[2]}.py").write_text(content)
+    (folder / "a_new_method.py").write_text(REGISTER.format(folder=str(folder), line=line))
+    return place[2]
+
+
+def suite() -> list[str]:
+    """The words after `pytest` in the recipe's fourth step."""
+    section = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split(f"\n## {RECIPE}\n")[1]
+    (words,) = re.findall(r"`\.venv/bin/pytest (-k [^`]*)`", section)
+    return [name for word in words.split() for name in (map(str, sorted(ROOT.glob(word))) if "*" in word else [word])]
+
+
+def test_the_suite_passes_as_it_is(fork_server: ForkServer, tmp_path: Path) -> None:
+    """Pose, regularizers, density, bake, train, resume to the bit, render, export, files, options."""
+    name = follow(tmp_path)
+    # The server has imported mien and jaxtyping, so types of the new method alone are checked.
+    options = ["-o", "addopts=--strict-markers", f"--jaxtyping-packages=mien.avatar.{name},beartype.beartype"]
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning", "-p", "no:cacheprovider", "-p", "a_new_method"]
+    words = [*options, *suite(), "-v"]
+    kept = {name: "" for name in ("PYTEST_XDIST_WORKER", "PYTEST_ADDOPTS", "PYTEST_CURRENT_TEST")}
+    process = fork_server.call("pytest:main", words, cwd=ROOT, env=kept, path=[tmp_path], exits=True)
+    assert process.wait() == 0, process.stdout[-6000:] + process.stderr[-2000:]
+    passed = set(re.findall(rf"::(\w+)\[{name}[^]]*\] PASSED", process.stdout))
+    assert "No test was skipped." in process.stdout
+    assert {
+        "test_first_fifty_steps_lower_the_loss",
+        "test_saved_avatar_renders_the_same_picture",
+        "test_baked_avatar_poses_as_the_avatar_does",
+        "test_an_avatar_becomes_a_file_a_page_and_a_mesh",
+        "test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped",
+    } <= passed
+    for file in ("test_runtime", "test_settings"):
+        assert re.search(rf"{file}\w*\.py::\w+\[{name}[^]]*\] PASSED", process.stdout)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from known import known
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
 from mien.capture.capture import Capture
@@ -29,9 +30,10 @@ from mien.render.camera_paths import orbit, turned_camera, turntable
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.tracking import Tracking
 from recordings import LAYOUTS, row, write_csv
+from refusals import refuses
+from shared_things import write_sequence, write_toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model, toy_sequence
-from toy_workspace import write_sequence, write_toy_workspace
 
 
 def _face(timesteps: int, seed: int = 0, expressions: int = 6) -> FaceParams:
@@ -52,8 +54,7 @@ def test_driving_an_avatar_with_itself_changes_nothing() -> None:
     torch.testing.assert_close(free.expression, avatar.expression + face.expression - neutral.expression)
     torch.testing.assert_close(bounded.expression, free.expression.clamp(0, 1))
     few = _face(3, expressions=5)
-    with pytest.raises(UserError, match="different face models"):
-        drive(few, neutral_of(few), avatar)
+    refuses("different face models", drive, few, neutral_of(few), avatar)
     # The face at rest ignores talking and a bad frame.
     talking, rest = _face(100), torch.tensor([0.3, 0.0, 0.0, 0.1, 0.0, 0.0])
     talking.expression[40:60] = rest
@@ -75,7 +76,7 @@ def test_motion_is_done_in_the_avatars_own_frame() -> None:
     assert torch.equal(still.head_rotation, avatar.head_rotation)
 
 
-def test_turntable_keeps_the_center_in_its_place() -> None:
+def test_turntables_and_cameras_aside_keep_the_center_in_its_place() -> None:
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center = torch.tensor([0.02, 0.05, -0.6])
     path = turntable(camera, center, 8)
@@ -92,10 +93,7 @@ def test_turntable_keeps_the_center_in_its_place() -> None:
     swing = turntable(camera, center, 8, span=1.0)
     for index, angle in ((2, 0.5), (6, -0.5), (4, 0.0)):
         torch.testing.assert_close(swing[index].viewmat, orbit(camera, center, angle).viewmat, atol=1e-6, rtol=0)
-
-
-def test_a_camera_aside_looks_at_the_same_place() -> None:
-    """A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit."""
+    # A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit.
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center, ahead = torch.tensor([0.0, 0.0, -0.6]), 0.6 * math.sqrt(0.75)
     for yaw, pitch, place in ((90, 0, [0.6, 0.0, 0.0]), (0, 30, [0.0, 0.3, ahead]), (90, 30, [ahead, 0.3, 0.0])):
@@ -143,13 +141,11 @@ def test_one_part_of_a_video_can_be_chosen(video: Path, tmp_path: Path) -> None:
     for part_name, expected in ((None, numbers), ("clip-2", [2] * 4)):
         driver = open_driver(video, part_name, toy_face_model())
         torch.testing.assert_close(driver.face.head_rotation[:, 0], 0.01 * torch.tensor(expected))
-        assert driver.pictures is not None
-        shown = [int(driver.pictures(index)[0, 0, 0]) for index in range(len(expected))]
+        shown = [int(known(driver.pictures)(index)[0, 0, 0]) for index in range(len(expected))]
         assert shown == [10 * number for number in expected]
         # All parts share one neutral face, with the head where it mostly is.
         assert float(driver.at_rest.head_rotation[0, 0]) == pytest.approx(0.02)
-    with pytest.raises(UserError, match="no sequence 'clip-3'; there are: clip-1, clip-10, clip-2"):
-        open_driver(video, "clip-3", toy_face_model())
+    refuses("no sequence 'clip-3'; there are: clip-1, clip-10, clip-2", open_driver, video, "clip-3", toy_face_model())
     write_toy_workspace(tmp_path / "w")
     run_driving_stage(tmp_path / "w/runs/toy", video, tmp_path / "driven.mp4")
     assert probe_video(tmp_path / "driven.mp4").frames == len(numbers)
@@ -161,13 +157,10 @@ def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
     take = write_csv(tmp_path / "a.csv", *(row(f"0:00:00:{2 * index:02d}.0", JawOpen=index / 4) for index in range(4)))
     for fps, expected in ((None, 30.0), (24.0, 12.0), (48.0, 24.0)):
         driver = open_driver(take, None, model, fps)
-        assert driver.fps == pytest.approx(expected)
-        assert len(driver.face) == 4
+        assert (driver.fps, len(driver.face)) == (pytest.approx(expected), 4)
     for by, fps in ((take, -1.0), (take, float("nan")), (tmp_path, 25.0)):
-        with pytest.raises(UserError, match="--fps"):
-            open_driver(by, None, model, fps)
-    with pytest.raises(UserError, match=r"--sequence a: .*a\.csv has no sequences"):
-        open_driver(take, "a", model)
+        refuses("--fps", open_driver, by, None, model, fps)
+    refuses(r"--sequence a: .*a\.csv has no sequences", open_driver, take, "a", model)
 
 
 PERFORMERS = [name for pair in PAIRS for name in pair]
@@ -209,19 +202,13 @@ def test_each_coefficient_moves_its_side_of_a_face() -> None:
         assert way * irises[:, 0].sum() > 0, name
 
 
-# -- times of frames --------------------------------------------------------------------------------------------------
-
-
-def test_a_pause_does_not_change_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
+def test_pauses_and_dropped_and_odd_frames_do_not_change_the_rate(capsys: pytest.CaptureFixture[str]) -> None:
     """A pause of 20 s in a clip at 30 frames a second leaves 30, however the file states its rate."""
     times = np.concatenate([np.arange(30), 600 + np.arange(30)]) / 30
     for nominal in (30.0, 60 / times[-1], 1000.0):
         assert frame_rate(times, nominal) == pytest.approx(30)
     assert pace_report("clip", times)["pauses"] == 1
     assert "clip: a pause of 19.0 s without a frame, after 1.0 s" in capsys.readouterr().err
-
-
-def test_dropped_and_odd_frames_do_not_change_the_rate() -> None:
     random = np.random.default_rng(0)
     kept = np.flatnonzero(random.uniform(size=300) > 0.2)
     assert frame_rate((kept - kept[0]) / 25, 25.0) == 25
@@ -254,8 +241,7 @@ def test_a_driver_moves_at_the_times_of_its_video(tmp_path: Path) -> None:
     driver = filmed_at(tmp_path / "half", frames, float(25 * len(frames) / frames[-1]))
     assert driver.fps == pytest.approx(25)
     torch.testing.assert_close(driver.face.head_rotation[:, 1], 0.01 * torch.arange(39), atol=1e-6, rtol=0)
-    assert driver.pictures is not None
-    shown = [int(driver.pictures(index)[0, 0, 0]) for index in range(39)]
+    shown = [int(known(driver.pictures)(index)[0, 0, 0]) for index in range(39)]
     assert shown[:21] == list(range(21))
     assert np.abs(frames[shown] - np.arange(39)).max() <= 1
     assert shown[-1] == 29
@@ -264,14 +250,11 @@ def test_a_driver_moves_at_the_times_of_its_video(tmp_path: Path) -> None:
     assert torch.equal(steady.face.head_rotation[:, 1], 0.01 * torch.arange(9).float())
 
 
-def test_a_driver_waits_in_a_pause(tmp_path: Path) -> None:
+def test_a_driver_waits_in_a_pause_but_not_in_one_that_never_ends(tmp_path: Path) -> None:
     """In a pause of two seconds, the face is held, and it moves on just before the next frame."""
     angles = filmed_at(tmp_path, np.concatenate([np.arange(10), 60 + np.arange(10)])).face.head_rotation[:, 1]
     assert len(angles) == 70
     assert (angles[9:60] - angles[9]).abs().max() < 1e-6
     torch.testing.assert_close(angles[60:], 0.01 * torch.arange(60, 70), atol=1e-6, rtol=0)
-
-
-def test_a_pause_that_never_ends_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="frame 5: comes 100 s after the one before"):
         filmed_at(tmp_path, np.concatenate([np.arange(5), 2500 + np.arange(5)]))

@@ -26,20 +26,18 @@ from mien.pipeline.expression import with_expression
 from mien.render.camera_paths import sway
 from mien.tracking.fitting.views import Views
 from mien.tracking.scoring import cut_matte
+from refusals import refuses
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera, toy_face
 
 
-def test_a_fitted_view_keeps_its_middle() -> None:
+def test_a_fitted_view_keeps_its_middle_and_a_resized_one_scales_each_axis() -> None:
     camera = camera_from_fov(0.5, 100, 200)
     axis = torch.tensor([[0.0, 0.0, 1.0]])
     for zoom in (1.0, 0.7, 2.5):
         fitted = camera.fitted(300, 90, zoom)
         torch.testing.assert_close(fitted.project(axis)[0], torch.tensor([[150.0, 45.0]]))
         assert float(fitted.K[0, 0]) == pytest.approx(float(camera.K[0, 0]) * zoom * 90 / 200)
-
-
-def test_a_camera_without_torch_scales_each_axis_by_its_own_factor() -> None:
     K = np.array([[300, 0, 90], [0, 320, 60], [0, 0, 1]], np.float32)
     resized = runtime.Camera(K, np.eye(4, dtype=np.float32), 200, 100).resized(100, 300)
     assert (resized.width, resized.height) == (100, 300)
@@ -74,8 +72,7 @@ def test_numbers_of_faces_and_face_models_have_limits_on_either_side() -> None:
         face = with_expression(rest, model, (f"{name}={value}",))
         found = face.expression[:, 0] if name == "move0" else face.joints[:, model.free_joint_names.index("neck"), 0]
         assert found.tolist() == [value] * 2
-        with pytest.raises(UserError, match=f"--set {name}={beyond}: {name} goes from"):
-            with_expression(rest, model, (f"{name}={beyond}",))
+        refuses(f"--set {name}={beyond}: {name} goes from", with_expression, rest, model, (f"{name}={beyond}",))
 
 
 def test_an_archive_may_have_a_comment(tmp_path: Path) -> None:
@@ -114,7 +111,7 @@ def test_the_first_of_chosen_timesteps_keeps_its_pictures() -> None:
     assert some.detected[:, 0, 0].tolist() == [0, 2, 8]
 
 
-def test_a_guided_filter_is_the_locally_affine_fit_to_colors() -> None:
+def test_a_guided_filter_is_locally_affine_and_the_matte_beside_the_head_whole_within_a_margin() -> None:
     """Values that are affine in the guide stay, with channels that vary together, as in real pictures."""
     random = np.random.default_rng(5)
     gray = random.random((40, 40, 1))
@@ -123,35 +120,23 @@ def test_a_guided_filter_is_the_locally_affine_fit_to_colors() -> None:
     values = guide @ np.array([0.6, -0.4, 0.8], np.float32) + 0.1
     found = guided_filter(guide, values, 8, 1e-7)
     np.testing.assert_allclose(found[8:-8, 8:-8], values[8:-8, 8:-8], atol=2e-3)
-
-
-def test_the_matte_beside_the_head_is_whole_within_a_margin() -> None:
-    """A head of 201 columns has a margin of 3 pixels, in which the matte is not cut."""
+    # A head of 201 columns has a margin of 3 pixels, in which the matte is not cut.
     head = np.zeros((300, 300), bool)
     head[50:250, 50:251] = True
     cut = cut_matte(np.full((300, 300), 255, np.uint8), head, np.full((300, 300), 0.5, np.float32))
-    assert cut[150, 253] == 255
-    assert cut[150, 254] == 128
-
-
-# Places and files -----------------------------------------------------------------------------------------------------
+    assert (cut[150, 253], cut[150, 254]) == (255, 128)
 
 
 def test_places_that_can_and_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "there.png").write_bytes(b"old")
     for name, folder in (
-        ("there.png", False),
-        ("new.png", False),
-        ("a/b/new.png", False),
-        (".", True),
-        ("a/new", True),
-    ):
+        ("there.png", False), ("new.png", False), ("a/b/new.png", False), (".", True), ("a/new", True),
+    ):  # fmt: skip
         check_writable(tmp_path / name, folder=folder)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["there.png"]
     os.mkfifo(tmp_path / "pipe")
     for odd in (tmp_path / "pipe", Path("/dev/null")):
-        with pytest.raises(UserError, match="not an ordinary file"):
-            check_writable(odd)
+        refuses("not an ordinary file", check_writable, odd)
     assert (tmp_path / "there.png").read_bytes() == b"old"
     longest = tmp_path / ("n" * 250 + ".bin")
     check_writable(longest)

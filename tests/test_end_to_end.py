@@ -23,8 +23,8 @@ from mien.cli import COMMANDS, main
 from mien.face.loading import add_face_model
 from mien.media.video import probe_video
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
+from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 from viewer_alone import page_of
 from web_case import chromium, drawn_head, violations
 
@@ -80,19 +80,14 @@ OF_A_VIDEO = {
     "batch": "{table} --out {out}/batch --program {stub}",
 }
 OF_A_RUN = {
-    "train": "{toy} --run third --steps 2 --split tail",
-    "evaluate": "{toy} --run toy",
+    "train": "{toy} --run third --steps 2 --split tail", "evaluate": "{toy} --run toy",
     "analyze": "gaussian-avatars {toy} --run toy --parts speed --seconds 0.01",
     "study": "make {toy} --out {out}/study.html --seconds 0.2 --side 64 --runs toy third",
     "render": "{toy} --run toy --out {out}/still.png",
-    "drive": "{toy} --run toy --by {toy} --out {out}/driven.mp4",
-    "export": "{demo} --out {out}/me.html",
-    "import": "{exported} --out {out}/imported",
-    "face-models": "--json",
-    "bench": "render --seconds 0.01 --json",
-    "licenses": "--json",
-    "plugins": "--json",
-}
+    "drive": "{toy} --run toy --by {toy} --out {out}/driven.mp4", "export": "{demo} --out {out}/me.html",
+    "import": "{exported} --out {out}/imported", "face-models": "--json",
+    "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
+}  # fmt: skip
 """Lines of every command but two: `demo` makes the subject, and `view` has a test of its own."""
 _FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
 
@@ -120,9 +115,7 @@ def test_no_command_needs_a_network(offline: Path, fork_server: ForkServer, tmp_
     run_all(fork_server, OF_A_VIDEO, video=video, out=tmp_path, table=table, stub=stub)
 
 
-def test_no_command_needs_a_network_once_there_is_a_run(
-    offline: Path, fork_server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_command_needs_a_network_once_there_is_a_run(offline, fork_server, tmp_path, monkeypatch) -> None:
     toy, exported = tmp_path / "toy", tmp_path / "exported"
     write_toy_workspace(toy, timesteps=20)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
@@ -130,19 +123,16 @@ def test_no_command_needs_a_network_once_there_is_a_run(
     lines = {"export": "{toy} --out {exported} --format gaussian-avatars"}
     run_all(fork_server, lines, toy=toy, exported=exported)
     run_all(fork_server, OF_A_RUN, demo=offline, toy=toy, exported=exported, out=tmp_path)
+    runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
+    viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
+    assert viewer.wait() == 0, viewer.stderr
+    assert "<html" in viewer.stdout
 
 
 def test_a_capture_by_litert_is_made_without_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
     pytest.importorskip("ai_edge_litert", reason="could not import ai_edge_litert")
     line = "{video} --out {out} --capture.detector litert --capture.max-frames 2"
     run_all(fork_server, {"capture": line}, video=offline / VIDEO, out=tmp_path)
-
-
-def test_the_viewer_needs_no_network_but_the_loopback(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
-    viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
-    assert viewer.wait() == 0, viewer.stderr
-    assert "<html" in viewer.stdout
 
 
 def view_alone(avatar: str) -> None:

@@ -122,6 +122,8 @@ def test_eyes_have_figures_of_their_own(experiment: Experiment, evaluation: Eval
     assert content["per_frame"]["eyes_psnr"][0] == pytest.approx(psnr(image, target, box), abs=1e-4)
     cut, goal = (enlarged(crop_to(picture, box), PART_SIDE) for picture in (image, target))
     assert min(cut.shape[:2]) == PART_SIDE
+    for shape, larger in (((10, 20, 3), (15, 30, 3)), ((20, 10, 3), (30, 15, 3)), ((20, 15, 3), (20, 15, 3))):
+        assert enlarged(torch.zeros(shape), 15).shape == larger, "by the shorter side, in its proportions"
     assert content["per_frame"]["eyes_perceptual"][0] == pytest.approx(load_perceptual()(cut, goal), abs=1e-4)
     assert content["eyes"]["psnr"] == pytest.approx(np.mean(content["per_frame"]["eyes_psnr"]), abs=1e-4)
     assert content["baselines"]["mesh"]["eyes"]["psnr"] < content["eyes"]["psnr"]
@@ -166,7 +168,7 @@ def _run_record() -> RunRecord:
     )  # fmt: skip
 
 
-def test_report_stands_alone_and_shows_everything(experiment: Experiment, evaluation: Evaluation) -> None:
+def test_report_stands_alone_shows_everything_and_survives_gaps(experiment: Experiment, evaluation: Evaluation) -> None:
     protocols = {"self_reenactment": protocol_content(experiment, evaluation, EvaluationSettings())}
     page = report_html(_run_record(), protocols, {"self_reenactment": (experiment, evaluation)})
     assert not re.search(r"https?://|<script|<link|url\(|/somewhere", page)
@@ -177,16 +179,12 @@ def test_report_stands_alone_and_shows_everything(experiment: Experiment, evalua
         assert len(re.findall(rf"<{tag}\b[^>]*(?<!/)>", page)) == page.count(f"</{tag}>"), f"<{tag}> is left open"
     assert (page.count("<img"), page.count("<svg")) == (3 * 6 + 4, 1 + 4 + 1)
     assert f"{protocols['self_reenactment']['head']['psnr']:.2f}" in page
-
-
-def test_charts_survive_gaps_and_flat_lines() -> None:
     x = np.arange(4.0)
     flat, gap, none = (
         line_chart([Series("one", x, np.array(values))], Axes("step", "loss"))
         for values in ([1.0] * 4, [1.0, np.nan, 2.0, 3.0], [np.nan] * 4)
     )
-    assert flat.count("L") == 3
-    assert gap.count("M") == 2
+    assert (flat.count("L"), gap.count("M")) == (3, 2)
     assert "nan" not in flat + gap
     assert "There are no values to draw" in none
     assert spans([]) == ()

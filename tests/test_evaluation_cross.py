@@ -11,7 +11,6 @@ import torch
 
 from evaluation_case import make_experiment, two_cameras, write_run, write_sequence
 from mien.cli import main
-from mien.errors import UserError
 from mien.evaluation import cross
 from mien.evaluation.cross import cross_reenactment, load_driven
 from mien.evaluation.redetection import angle_degrees, measure_motion, transfer_figures
@@ -20,6 +19,7 @@ from mien.media.video import probe_video
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking import write_tracking
 from plain_settings import plain_run
+from refusals import refuses
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
 
@@ -117,9 +117,7 @@ def test_drivers_that_cannot_drive(folders: tuple[Path, Path], tmp_path: Path, m
     monkeypatch.setattr(cross.Driven, "driver_picture", lambda self, timestep: np.full((8, 8, 3), 255, np.uint8))
     own, driver = folders
     run = own.parent.parent / "runs" / "first"
-    with pytest.raises(UserError, match="no face is found in the driver's pictures"):
-        cross_reenactment(run, own, [driver], 0)
+    refuses("no face is found in the driver's pictures", cross_reenactment, run, own, [driver], 0)
     tracking = replace(make_experiment(timesteps=10).sequences[0].tracking, face_model_hash="other")
     write_tracking(tmp_path / "sequences" / "x" / "tracking", tracking)
-    with pytest.raises(UserError, match="track the driver with the avatar's"):
-        cross_reenactment(run, own, [tmp_path / "sequences" / "x"], 0)
+    refuses("track the driver with the avatar's", cross_reenactment, run, own, [tmp_path / "sequences" / "x"], 0)

@@ -1,7 +1,5 @@
 """A run's folder becomes metrics.json and report.html, through the files that the earlier stages write.
-
-Runs are scored by time, by sequence and by camera; tables compare them.
-"""
+Runs are scored by time, by sequence and by camera; tables compare them."""
 
 import json
 import re
@@ -19,13 +17,12 @@ from evaluation_case import SIZE, make_experiment, two_cameras, write_run, write
 from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.disk.files import read_tensors, write_json, write_tensors
-from mien.errors import UserError
 from mien.evaluation import evaluate, protocols
 from mien.evaluation.baselines import make_baselines
 from mien.evaluation.compare import compare_runs
 from mien.evaluation.evaluate import is_evaluated
 from mien.evaluation.experiment import Experiment, head_box, target_image
-from mien.evaluation.load import load_experiments
+from mien.evaluation.load import held_out_by_protocol, load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import read_metrics
 from mien.evaluation.protocols import EvaluationSettings, evaluate_frames
@@ -38,6 +35,7 @@ from mien.tracking.scoring_files import write_scoring
 from mien.training import read_sequence
 from mien.training.footage.frames import Frame, spread_frames
 from plain_settings import plain_run
+from refusals import refuses
 
 pytestmark = pytest.mark.usefixtures("short_films")
 STEPS = 6
@@ -134,15 +132,11 @@ def test_held_out_frames_are_those_training_left_out_and_said_to_be_corrected(wo
 
 def test_wrong_sequences_and_unfinished_runs(made: tuple[Path, Path], tmp_path: Path) -> None:
     folder, run_dir = made
-    with pytest.raises(UserError, match="was trained on clip"):
-        evaluate(run_dir, [folder.with_name("other")])
-    with pytest.raises(UserError, match="missing"):
-        evaluate(tmp_path, [folder])
-    with pytest.raises(UserError, match="missing"):
-        read_metrics(tmp_path)
+    refuses("was trained on clip", evaluate, run_dir, [folder.with_name("other")])
+    refuses("missing", evaluate, tmp_path, [folder])
+    refuses("missing", read_metrics, tmp_path)
     shutil.copy(run_dir / "config.json", tmp_path)
-    with pytest.raises(UserError, match="was not finished; run the same `mien train` or `mien create` again"):
-        evaluate(tmp_path, [folder])
+    refuses("was not finished; run the same `mien train` or `mien create` again", evaluate, tmp_path, [folder])
 
 
 def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path]) -> None:
@@ -150,8 +144,7 @@ def test_masks_of_other_pictures_are_refused(workspace: tuple[Path, Path]) -> No
     shutil.rmtree(folder / "scoring")
     write_scoring(folder / "scoring", make_experiment(20).scorings[0], capture_hash="of another capture")
     for read in (lambda: evaluate(run_dir, [folder]), lambda: read_sequence(folder)):
-        with pytest.raises(UserError, match=r"scoring: its masks belong to other pictures .* run `mien track` again"):
-            read()
+        refuses(r"scoring: its masks belong to other pictures .* run `mien track` again", read)
 
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=16)
@@ -193,6 +186,12 @@ def test_protocols_hold_what_training_left_out(experiments: dict[str, Experiment
     }
     assert set(experiments["novel_view"].training_frames) == {Frame(0, t, 0) for t in range(16)}
     assert {one.split for one in experiments.values()} == {"blocks", "sequences", "cameras"}
+    # A timestep that no training camera saw is no novel view: its face is not known.
+    talk, valid = experiments["novel_view"].sequences[0], np.arange(40).reshape(20, 2) != 6
+    (_, views) = held_out_by_protocol(
+        [replace(talk, capture=replace(talk.capture, valid=valid))], plain_run(held_out_cameras=("side",))
+    )["novel_view"]
+    assert views == tuple(Frame(0, t, 1) for t in range(16) if t != 3)
     assert {one.face_source for one in experiments.values()} == {"as_tracked"}
     # Figures say what they are of.
     sequence, view = (scored["held"]["protocols"][name] for name in ("self_reenactment_sequence", "novel_view"))
@@ -262,8 +261,7 @@ def test_evaluation_goes_on_where_it_was(root: Path, scored: dict[str, dict], mo
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(protocols, "drawn_frames", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(run_dir, [folder], quick)
+    pytest.raises(KeyboardInterrupt, evaluate, run_dir, [folder], quick)
     partial = run_dir / ".self_reenactment.partial"
     kept = len(partial.read_text().splitlines()) - 1
     assert kept >= 2
@@ -308,8 +306,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(root: Path, tmp
     assert len(comparison.tables) == 2
     warnings = "\n".join(comparison.warnings)
     write_json(other / "metrics.json", "mien.metrics", 99, {})
-    with pytest.raises(UserError, match=r"version 99.*version 1"):
-        read_metrics(other)
+    refuses(r"version 99.*version 1", read_metrics, other)
     if other_in == "mask":
         assert "because they were scored on other frames, pictures or masks: short | other" in warnings
     else:
@@ -317,8 +314,7 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(root: Path, tmp
         assert [table.edges for table in comparison.tables] == ["cleaned", "filmed"]
         assert "blocks, soft edges as filmed)" in comparison_text(comparison)
     assert "never: was not evaluated" in warnings
-    with pytest.raises(UserError, match="no evaluated run"):
-        compare_runs({"never": tmp_path / "never"})
+    refuses("no evaluated run", compare_runs, {"never": tmp_path / "never"})
 
 
 @pytest.mark.unchecked

@@ -1,7 +1,5 @@
 """Files that would take gigabytes or minutes, hold huge numbers, or were findings of the fuzzers: refused in one line.
-
-Each is refused before memory is taken, and the line names the file.
-"""
+Each is refused before memory is taken, and the line names the file."""
 
 import io
 import json
@@ -49,6 +47,7 @@ from mien.media.picture_files import decode_png, png_fits
 from mien.runtime.checks import check
 from mien.training import train
 from recordings import row, write_csv, write_json
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from test_glb_avatar import rewritten, written
 from test_splat_files import needs_usd, some
@@ -109,12 +108,19 @@ def test_members_of_a_sog_have_bounds(tmp_path: Path) -> None:
         refused(read_sog, path, r"cannot be read as \.sog")
 
 
-def test_rows_of_a_ply_have_a_bound(tmp_path: Path) -> None:
+def test_rows_of_a_ply_and_lists_of_json_have_a_bound(tmp_path: Path) -> None:
     names = [*property_names(1), *(f"more_{index}" for index in range(2000))]
     lines = "".join(f"property float {name}\n" for name in names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex 1000000\n{lines}end_header\n"
     path = sparse(tmp_path / "a.ply", 10 << 30, head.encode())
     refused(read_ply, path, "bytes of vertices, more than 536,870,912; leave columns out")
+    # Empty lists take twenty times their text.
+    path = tmp_path / "a.json"
+    path.write_text("[" + "[]," * (20 << 20) + "[]]")
+    refused(read_blendshape_json, path, "too many lists, objects or numbers", 200 * MIB)
+    names = ",".join(f'"{index}": 0' for index in range(30_000))
+    with allocating_at_most(256 * MIB, 60), pytest.raises(ValueError, match="it holds '0' twice"):
+        parse_json(f'{{{names}, "0": 1}}', unique_names=True)
 
 
 def test_landmarks_are_as_large_as_their_frames_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,19 +143,7 @@ def test_landmarks_are_as_large_as_their_frames_need(tmp_path: Path, monkeypatch
     assert len(read) < 10, "only as many as there are frames are held"
 
 
-def test_lists_of_json_have_a_bound(tmp_path: Path) -> None:
-    """Empty lists take twenty times their text."""
-    path = tmp_path / "a.json"
-    path.write_text("[" + "[]," * (20 << 20) + "[]]")
-    refused(read_blendshape_json, path, "too many lists, objects or numbers", 200 * MIB)
-    names = ",".join(f'"{index}": 0' for index in range(30_000))
-    with allocating_at_most(256 * MIB, 60), pytest.raises(ValueError, match="it holds '0' twice"):
-        parse_json(f'{{{names}, "0": 1}}', unique_names=True)
-
-
-def test_a_message_shows_the_beginning_and_the_remedy(
-    made_once: MadeOnce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_message_shows_the_beginning_and_the_remedy(made_once: MadeOnce, tmp_path: Path, capsys) -> None:
     """A shape of thirty thousand sides would fill the terminal."""
     shutil.copytree(toy_workspace(made_once), tmp_path / "W")
     track = tmp_path / "W" / "runs" / "toy" / "face_track.safetensors"
@@ -188,11 +182,8 @@ def test_a_stage_that_names_other_files_is_refused(tmp_path: Path) -> None:
         path.write_text(good[:start] + number + good[good.index(",", start) :])
         refused(read_usd, path, "1 of 4 Gaussians are NaN or infinite")
     path.write_text(good.replace("point3f[] positions", "string[] positions").replace("[(", '["', 1))
-    with pytest.raises(UserError):
-        read_usd(path)
+    pytest.raises(UserError, read_usd, path)
 
-
-# Motion ---------------------------------------------------------------------------------------------------------------
 
 START = [row(f"0:00:00:0{frame}.0") for frame in range(6)]
 MATRIX = {"facialTransformationMatrixes": [{"data": [*([0] * 15), DIGITS]}], "faceBlendshapes": []}
@@ -243,8 +234,7 @@ def test_huge_numbers_lines_and_gaps_of_recordings(tmp_path: Path, monkeypatch: 
 def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     path = tmp_path / "0.png"
     assert cv2.imwrite(str(path), np.zeros((8, 8), np.uint8))
-    with pytest.raises(UserError, match="ends before its frame 1"):
-        GivenMattes(tmp_path, (8, 8)).matte(1, whole_picture(8, 8, 8))
+    refuses("ends before its frame 1", GivenMattes(tmp_path, (8, 8)).matte, 1, whole_picture(8, 8, 8))
     data = path.read_bytes()
     assert png_fits(data)
     assert png_fits(data + b"whatever other programs add")
@@ -252,11 +242,10 @@ def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     assert not png_fits(data[:chunk] + b"\xff\xff\xff\xf0" + data[chunk + 4 :]), "a decoder would allocate 4 GB"
     assert not png_fits(data[:-12])
     path.write_bytes(b"\x89PNG\r\n\x1a\nIEND\xaeB`\x82")
-    with pytest.raises(UserError, match=r"0\.png: damaged"):
-        decode_png(path, (8, 8), "capture again")
+    refuses(r"0\.png: damaged", decode_png, path, (8, 8), "capture again")
 
 
-def test_faces_of_another_type_or_size_are_named(tmp_path: Path) -> None:
+def test_faces_of_another_type_or_size_and_those_that_face_nowhere_are_named(tmp_path: Path) -> None:
     model, sequence = toy_sequence(timesteps=5, size=32)
     face = sequence.tracking.face
     with pytest.raises(UserError, match=r"here: expression is torch\.float64"):
@@ -265,16 +254,11 @@ def test_faces_of_another_type_or_size_are_named(tmp_path: Path) -> None:
         drive(replace(face, joints=face.joints[:, :0]), face, face, who="take.csv")
     tracking = replace(sequence.tracking, face=replace(face, identity=torch.zeros(0)))
     other = replace(sequence, tracking=tracking, folder=tmp_path / "clip")
-    with pytest.raises(UserError, match=r"clip: identity is \[0\]"):
-        train([other], model, train_toy.CONFIG, train_toy.SETTINGS, tmp_path / "run")
-
-
-def test_triangles_that_face_nowhere(tmp_path: Path) -> None:
+    refuses(r"clip: identity is \[0\]", train, [other], model, train_toy.CONFIG, train_toy.SETTINGS, tmp_path / "run")
     arrays = tiny_flame()
     turned: dict[str, Any] = {**arrays, "f": arrays["f"][:, ::-1]}
     np.savez(tmp_path / "tiny.npz", **turned)
-    with pytest.raises(UserError, match=r"tiny\.npz: 'f' has no triangle that faces outwards"):
-        read_flame(tmp_path / "tiny.npz")
+    refuses(r"tiny\.npz: 'f' has no triangle that faces outwards", read_flame, tmp_path / "tiny.npz")
 
 
 def test_a_prim_of_usd_without_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -292,8 +276,7 @@ def test_a_prim_of_usd_without_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path:
             pytest.fail("USD would end the process here")
 
     monkeypatch.setattr(Sdf.Layer, "FindOrOpen", lambda path: Damaged())
-    with pytest.raises(UserError, match="is damaged, or not a USD file"):
-        read_usd(tmp_path / "head.usda")
+    refuses("is damaged, or not a USD file", read_usd, tmp_path / "head.usda")
 
 
 # Matrices, which hold a rotation and a translation. `fuzzing.values` has those of cameras -----------------------------
@@ -323,16 +306,13 @@ def test_bad_matrices_and_numbers_of_ply_files(tmp_path: Path, monkeypatch: pyte
         assert told in str(rigid_fault(matrix))
         own = " ".join(str(value) for value in matrix.flatten()).encode()
         path.write_bytes(head + words + own + b"\n" + rest)
-        with pytest.raises(UserError, match="has a damaged frame comment"):
-            read_ply(path)
+        refuses("has a damaged frame comment", read_ply, path)
     start = whole.index(b"end_header\n") + len(b"end_header\n")
     path.write_bytes(whole[:start] + np.float32(np.nan).tobytes() + whole[start + 4 :])
-    with pytest.raises(UserError, match="position of some Gaussians is NaN"):
-        read_ply(path)
+    refuses("position of some Gaussians is NaN", read_ply, path)
     path.write_bytes(head + words + line + b"\n" + rest)
     monkeypatch.setattr(ply, "MAX_GAUSSIANS", 4)
-    with pytest.raises(UserError, match=r"a\.ply: has 5 Gaussians, more than 4"):
-        read_ply(path)
+    refuses(r"a\.ply: has 5 Gaussians, more than 4", read_ply, path)
 
 
 def test_poses_of_mien_files() -> None:
@@ -343,6 +323,11 @@ def test_poses_of_mien_files() -> None:
     weights = np.full(len(baked.attributes.quats), 0.1, np.float32)
     posed = replace(baked, still_weights=weights, still_pose=TURN.astype(np.float32))
     check(replace(portable, baked=posed), "a.mien")
-    for matrix, words in BAD[:4]:
+    for wrong, words in (
+        (weights[1:], "weights of the bone that"), (np.append(weights, weights[:1]), "weights of the bone that"),
+        (None, "weights or a pose, but not both"),
+    ):  # fmt: skip
         with pytest.raises(UserError, match=words):
-            check(replace(portable, baked=replace(posed, still_pose=matrix.astype(np.float32))), "a.mien")
+            check(replace(portable, baked=replace(posed, still_weights=wrong)), "a.mien")
+    for matrix, words in BAD[:4]:
+        refuses(words, check, replace(portable, baked=replace(posed, still_pose=matrix.astype(np.float32))), "a.mien")

@@ -3,7 +3,6 @@
 import gzip
 import math
 import struct
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from known import known
 from mien import runtime
 from mien.camera import camera_from_fov
 from mien.cli import main
@@ -31,6 +31,7 @@ from mien.pipeline.picture_options import PictureOptions
 from mien.render import rasterize
 from mien.render.camera_paths import read_cameras, sway, write_cameras
 from mien.rotation import matrix_from_axis_angle, rigid_transform
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from test_splat_files import some
 from web_case import drawn_head
@@ -46,7 +47,6 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
     header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
     path = tmp_path / "other.ply"
     path.write_bytes(header.encode() + struct.pack(f"<{len(row)}f", *row))
-
     read = read_ply(path)
     assert read.means.tolist() == [[1, 2, 3]]
     assert read.sh[0].tolist() == [[10, 20, 30], [11, 21, 31], [12, 22, 32], [13, 23, 33]]
@@ -54,7 +54,6 @@ def test_layout_is_the_one_other_programs_write(tmp_path: Path) -> None:
     torch.testing.assert_close(read.scales[0], torch.tensor([-1.0, -2.0, -3.0]).exp())
     torch.testing.assert_close(read.quats[0], torch.tensor([0, 0.6, 0, 0.8]))
     assert read.T_world_local is None
-
     ours = tmp_path / "ours.ply"
     write_ply(ours, read)
     content = ours.read_bytes()
@@ -69,8 +68,7 @@ def test_a_local_frame_is_kept_and_gaussians_in_world_look_the_same(tmp_path: Pa
     local = replace(some(80, 16), T_world_local=pose)
     write_ply(tmp_path / "a.ply", local)
     read = read_ply(tmp_path / "a.ply")
-    assert read.T_world_local is not None
-    assert torch.equal(read.T_world_local, pose)
+    assert torch.equal(known(read.T_world_local), pose)
     assert torch.equal(read.means, local.means)
     camera = camera_from_fov(0.6, 48, 40, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     moved = in_world(local)
@@ -83,8 +81,7 @@ def test_a_local_frame_is_kept_and_gaussians_in_world_look_the_same(tmp_path: Pa
 
 def test_damaged_and_foreign_files(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    with pytest.raises(UserError, match="cannot be read"):
-        read_ply(path)
+    refuses("cannot be read", read_ply, path)
     write_ply(path, some(5, 1))
     content = path.read_bytes()
     for message, damaged in {
@@ -96,8 +93,7 @@ def test_damaged_and_foreign_files(tmp_path: Path) -> None:
         "first element": content.replace(b"element vertex", b"element corner"),
     }.items():
         path.write_bytes(damaged)
-        with pytest.raises(UserError, match=message):
-            read_ply(path)
+        refuses(message, read_ply, path)
 
 
 def test_a_ply_can_have_coefficients_of_degree_3(tmp_path: Path, made_once: MadeOnce) -> None:
@@ -117,8 +113,7 @@ def test_a_ply_can_have_coefficients_of_degree_3(tmp_path: Path, made_once: Made
     assert torch.equal(found.sh[:, : own.sh.shape[1]], own.sh)
     assert not found.sh[:, own.sh.shape[1] :].any()
     assert torch.equal(found.means, own.means)
-    with pytest.raises(UserError, match="--sh 1: the avatar has degree 3; give 3 or more, or leave it out"):
-        write_ply(tmp_path / "b.ply", found, 1)
+    refuses("--sh 1: the avatar has degree 3; give 3 or more, or leave it out", write_ply, tmp_path / "b.ply", found, 1)
 
 
 def test_options_that_do_not_fit_the_output_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,7 +151,7 @@ def disc(size: int = 64) -> np.ndarray:
     return to_rgba(colors * alpha[..., None], alpha)
 
 
-def test_colors_are_straight_and_a_png_keeps_every_value(tmp_path: Path) -> None:
+def test_colors_are_straight_a_png_keeps_every_value_and_outlines_have_no_fringe(tmp_path: Path) -> None:
     picture = disc()
     seen = picture[..., 3] > 8
     assert np.abs(picture[seen][:, :3].astype(int) - [204, 77, 51]).max() <= 1
@@ -166,9 +161,6 @@ def test_colors_are_straight_and_a_png_keeps_every_value(tmp_path: Path) -> None
     read = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert read is not None
     assert np.array_equal(cv2.cvtColor(read, cv2.COLOR_BGRA2RGBA), picture)
-
-
-def test_webm_keeps_alpha_and_outlines_have_no_fringe(tmp_path: Path) -> None:
     write_pictures(plan_output(tmp_path / "a.webm", 3, True), [disc(65)] * 3, 25)
     decoder, frames = av.CodecContext.create("libvpx-vp9", "r"), []
     assert isinstance(decoder, av.VideoCodecContext)
@@ -198,13 +190,11 @@ def test_films_and_sequences(tmp_path: Path) -> None:
         ("a.mp4", 5, True, "cannot be transparent"), ("file/a.mp4", 5, False, "not a folder|Not a directory"),
         ("file", 5, False, "is a file"), ("frames", 2, False, "longer sequence"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=part):
-            plan_output(tmp_path / name, frames, transparent)
+        refuses(part, plan_output, tmp_path / name, frames, transparent)
     assert PictureOptions(background="#3060a0").color() == (48 / 255, 96 / 255, 160 / 255)
     wrong = (PictureOptions(size=8193), PictureOptions(width=5), PictureOptions(background="pinkish"))
     for options, part in zip(wrong, ("--size 8193", "--width 5", "--background pinkish"), strict=True):
-        with pytest.raises(UserError, match=part):
-            options.plan(tmp_path / "a.png", 1)
+        refuses(part, options.plan, tmp_path / "a.png", 1)
 
 
 def test_one_view_over_every_background() -> None:
@@ -242,11 +232,7 @@ def test_cameras_sway_around_the_head_and_come_from_a_file(tmp_path: Path) -> No
         ([entry | {"K": "big"}], "needs K"),
     ):  # fmt: skip
         write_json(path, "mien.cameras", 1, {"cameras": wrong})
-        with pytest.raises(UserError, match=part):
-            read_cameras(path)
-
-
-# As other programs write them -----------------------------------------------------------------------------------------
+        refuses(part, read_cameras, path)
 
 
 def written(path: Path, types: dict[str, str], newline: str, coefficients: int = 4) -> dict[str, np.ndarray]:
@@ -267,9 +253,7 @@ def written(path: Path, types: dict[str, str], newline: str, coefficients: int =
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("types", [
-    {},
-    {"red": "uint8", "green": "uint8", "blue": "uint8"},
-    {"nx": "int16", "label": "uint32", "time": "float64"},
+    {}, {"red": "uint8", "green": "uint8", "blue": "uint8"}, {"nx": "int16", "label": "uint32", "time": "float64"},
     {"*": "float64"},
 ])  # fmt: skip
 def test_every_ply_of_floats_is_read(tmp_path: Path, newline: str, types: dict[str, str]) -> None:
@@ -293,8 +277,7 @@ def test_other_plys_are_named(tmp_path: Path, types: dict[str, str], extra: str,
     path = tmp_path / "a.ply"
     written(path, types, "\n")
     path.write_bytes(path.read_bytes().replace(b"end_header", extra.encode() + b"end_header", 1))
-    with pytest.raises(UserError, match=words):
-        read_ply(path)
+    refuses(words, read_ply, path)
 
 
 def spz(path: Path, version: int, quats: list[tuple[int, int, int]], degree: int = 0) -> Path:
@@ -318,8 +301,7 @@ def test_spz_of_version_2_is_read(tmp_path: Path, degree: int) -> None:
     expected = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0.529, 0.6, 0, -0.6]])
     torch.testing.assert_close(read.quats, expected, atol=0.005, rtol=0)
     torch.testing.assert_close(read.scales, torch.ones(4, 3))
-    assert read.opacities.tolist() == [1] * 4
-    assert read.sh.shape == (4, (degree + 1) ** 2, 3)
+    assert (read.opacities.tolist(), read.sh.shape) == ([1] * 4, (4, (degree + 1) ** 2, 3))
     assert (read.sh[:, 1:] == 0.5).all()
 
 
@@ -327,22 +309,3 @@ def test_other_versions_of_spz_are_named(tmp_path: Path) -> None:
     for version in (1, 7):
         with pytest.raises(UserError, match=rf"\(it is of version {version}\); give a .spz of version 2, 3 or 4"):
             read_spz(spz(tmp_path / "a.spz", version, [(128, 128, 128)]))
-
-
-def test_random_damage_is_told_in_one_line(tmp_path: Path) -> None:
-    """Mutations of each new reader's input give Gaussians that are finite, or a UserError."""
-    random = np.random.default_rng(0)
-    ply, old = tmp_path / "a.ply", spz(tmp_path / "a.spz", 2, [(1, 2, 3)] * 9)
-    written(ply, {"red": "uint8", "*": "float64"}, "\r\n", 1)
-    for path, read, content in (
-        (ply, read_ply, ply.read_bytes()),
-        (old, read_spz, gzip.decompress(old.read_bytes())),
-    ):
-        for _ in range(40):
-            damaged = bytearray(content)
-            for at in random.integers(0, min(len(damaged), 700), 2):
-                damaged[at] = random.integers(256)
-            damaged = damaged[: random.integers(1, len(damaged) + 1)] if random.random() < 0.3 else damaged
-            path.write_bytes(gzip.compress(bytes(damaged), 1) if path == old else bytes(damaged))
-            with suppress(UserError):
-                assert all(part.isfinite().all() for part in vars(read(path)).values() if part is not None)

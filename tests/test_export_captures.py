@@ -1,8 +1,7 @@
 """Captures in the layouts of INSTA, IMavatar, NeRFace and NeRSemble: importers read them, and others' formulas fit.
 
 The importers are tested with writers that call nothing of mien. What they do not read, or read in several ways, is
-checked by matrices from the description of the layout.
-"""
+checked by matrices from the description of the layout."""
 
 import json
 import re
@@ -18,6 +17,7 @@ import torch
 from dataset_checks import CAMERA, PIXELS, check_intrinsics, check_projection, filmed_camera, read
 from dataset_scene import SIDE, NoDetector, Scene, draw, drawn_person, head_view, projected
 from dataset_writers import UNEQUAL, rotation_of, tracker_frame
+from known import known
 from mien.camera import Camera
 from mien.capture import write_capture
 from mien.capture.store import read_capture_hash
@@ -40,7 +40,8 @@ from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.training import TrainSettings
 from mien.training.footage.sequence import Sequence
-from toy_workspace import write_toy_workspace
+from refusals import refuses
+from shared_things import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
 
@@ -104,8 +105,7 @@ def filmed(sequence: Sequence, scene: Scene, **settings: Any) -> Filmed:
 
 
 def export(folder: Path, name: str, content: Filmed) -> Path:
-    layout = find_layout(name)
-    assert layout is not None
+    layout = known(find_layout(name))
     write_layout(folder, content, layout)
     return folder
 
@@ -133,10 +133,7 @@ def test_insta_is_read_back(folders: dict[str, Path], single: Sequence, scene: S
     for part in ("flame", "opencv"):
         shapes = [{name: (array.shape, array.dtype) for name, array in each[part].items()} for each in (frame, wanted)]
         assert shapes[0] == {name: shapes[1][name] for name in shapes[0]}
-
-
-def test_insta_by_its_own_conventions(folders: dict[str, Path], single: Sequence, scene: Scene) -> None:
-    """Cameras are camera-to-world with OpenCV's axes, and meshes are seen by them as the person in the pictures is."""
+    # Cameras are camera-to-world with OpenCV's axes, and meshes are seen by them as the person in the pictures is.
     folder = folders["insta"]
     content = json.loads((folder / "transforms.json").read_text())
     K = np.array([[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]])
@@ -147,8 +144,7 @@ def test_insta_by_its_own_conventions(folders: dict[str, Path], single: Sequence
         drawn = projected(scene.vertices(timestep), UNEQUAL, *view(0))
         assert np.abs(projected(mesh, K, seen[:3, :3], seen[:3, 3]) - drawn).max() < PIXELS
         np.testing.assert_allclose(np.loadtxt(folder / frame["exp_path"]), scene.expr[timestep], rtol=0, atol=1e-6)
-        depth = cv2.imread(str(folder / frame["depth_path"]), cv2.IMREAD_UNCHANGED)
-        assert depth is not None
+        depth = known(cv2.imread(str(folder / frame["depth_path"]), cv2.IMREAD_UNCHANGED))
         assert ((depth > 0) == (single.capture.mattes[timestep, 0] > 127)).mean() > 0.99
         assert 0.7e3 < np.median(depth[depth > 0]) < 1.2e3
 
@@ -173,8 +169,7 @@ def test_nerface_is_read_back(folders: dict[str, Path], single: Sequence, scene:
     train, test = read(folders["nerface"], "nerface", scene.model)
     fx, fy, *_ = json.loads((folders["nerface"] / "transforms_test.json").read_text())["intrinsics"]
     assert fx < 0 < fy, "the world is mirrored, as in the published files"
-    unit = re.search(r"unit is (\S+) m\.", (folders["nerface"] / "README.txt").read_text())
-    assert unit is not None
+    unit = known(re.search(r"unit is (\S+) m\.", (folders["nerface"] / "README.txt").read_text()))
     for sequence, timesteps in ((train, TRAINED), (test, HELD_OUT)):
         over_white = np.stack([filmed(single, scene).over_white(timestep) for timestep in timesteps])
         assert np.array_equal(sequence.capture.images[:, 0], over_white)
@@ -249,8 +244,7 @@ def test_what_a_layout_cannot_hold_is_told_or_refused(
             export(tmp_path / name, name, filmed(both, scene))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").touch()
-    with pytest.raises(UserError, match="full: is not empty"):
-        export(tmp_path / "full", "nersemble", filmed(both, scene))
+    refuses("full: is not empty", export, tmp_path / "full", "nersemble", filmed(both, scene))
     with pytest.raises(UserError, match=f"{tmp_path}/my_images: programs of this layout replace every 'image'"):
         export(tmp_path / "my_images", "imavatar", filmed(single, scene))
     other = replace(single, tracking=replace(single.tracking, face=anny.neutral(TIMESTEPS), face_model="anny"))
@@ -267,9 +261,7 @@ def test_what_a_layout_cannot_hold_is_told_or_refused(
         assert not [file for file in folder.rglob("*") if file.suffix in (".frame", ".npz")]
 
 
-def test_the_command(
-    single: Sequence, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     workspace, out = tmp_path / "W", tmp_path / "out"
     folder = workspace / "sequences" / "clip"
     write_capture(folder / "capture", single.capture)
@@ -305,5 +297,4 @@ def test_a_run_decides_what_is_held_out(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path)
     assert settings_of(workspace, "clip", "toy", None).split == "tail"
     assert settings_of(workspace, "clip", None, None).split == "blocks"
-    with pytest.raises(UserError, match="--run toy: was trained on clip, not on other"):
-        settings_of(workspace, "other", "toy", None)
+    refuses("--run toy: was trained on clip, not on other", settings_of, workspace, "other", "toy", None)

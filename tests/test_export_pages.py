@@ -21,6 +21,7 @@ from mien.formats.shared.packed import unpacked
 from mien.formats.shared.rows import with_rows
 from mien.formats.shared.thinning import contributions
 from mien.formats.shared.webcam import OWN, POLICY, VERSION, find_webcam_files, own_model
+from refusals import refuses
 from test_runtime import SIZE, new_avatar
 from toy_scene import toy_camera
 from web_case import WEB, drawn_head, faces_of, tasks_vision
@@ -124,9 +125,7 @@ def refused(page: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
 
 
 @pytest.mark.unchecked
-def test_the_command_needs_nothing_but_what_comes_with_mien(
-    page: Path, monkeypatch: pytest.MonkeyPatch, test_data: Path
-) -> None:
+def test_the_command_needs_nothing_but_what_comes_with_mien(page: Path, monkeypatch, test_data: Path) -> None:
     """A page with a webcam has the same bytes each time, and a page without one has nothing of it."""
     tasks_vision()
     for variable in ("MIEN_FACE_LANDMARKER", "MIEN_TASKS_VISION"):
@@ -155,9 +154,20 @@ def test_the_model_is_the_published_one_and_one_version_is_pinned() -> None:
     assert f"@mediapipe/tasks-vision@{VERSION}\n" in (WEB.parent / "Makefile").read_text()
 
 
-def test_a_model_without_its_second_part_is_explained(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
+    """In mien's own folder, the largest file lies compressed."""
+    (wasm,) = package.rglob("vision_wasm_internal.wasm")
+    compressed = package / "vision_wasm_internal.wasm.xz"
+    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
+    wasm.unlink()
+    assert find_webcam_files().package == package, "its content has the right hash"
+    cut = compressed.read_bytes()[:-100]
+    for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
+        compressed.write_bytes(content)
+        refuses(told, find_webcam_files)
+
+
+def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monkeypatch, capsys, tmp_path) -> None:
     """mien from a source distribution lacks the network for blend shapes. A model that is given serves."""
     monkeypatch.setenv("MIEN_TASKS_VISION", str(tasks_vision()))
     monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
@@ -171,13 +181,7 @@ def test_a_model_without_its_second_part_is_explained(
     assert find_webcam_files(model).model == model
     model.write_bytes(b"")
     assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
-
-
-def test_a_wrong_model_is_explained(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    tasks_vision()
-    model = tmp_path / "any.task"
+    model.unlink()
     monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))
     assert f"{model}: no such file; give MediaPipe's face landmarker" in refused(page, capsys)
     for content in (b"", b"PK\x03\x04 no archive"):
@@ -201,17 +205,3 @@ def test_a_missing_or_other_package_is_explained(page: Path, package: Path, caps
     told = refused(page, capsys)
     for part in ("needs vision_bundle.cjs", "make landmarker", f"@mediapipe/tasks-vision@{VERSION}"):
         assert part in told
-
-
-def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
-    """In mien's own folder, the largest file lies compressed."""
-    (wasm,) = package.rglob("vision_wasm_internal.wasm")
-    compressed = package / "vision_wasm_internal.wasm.xz"
-    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
-    wasm.unlink()
-    assert find_webcam_files().package == package, "its content has the right hash"
-    cut = compressed.read_bytes()[:-100]
-    for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
-        compressed.write_bytes(content)
-        with pytest.raises(UserError, match=told):
-            find_webcam_files()

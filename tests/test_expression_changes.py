@@ -1,7 +1,5 @@
 """Changes of gaussian_avatars with the expression: their formulas, and what of them is kept and refused.
-
-`test_methods` trains, resumes, saves and bakes them, as the configuration `gaussian_avatars-features`.
-"""
+`test_methods` trains, resumes, saves and bakes them, as the configuration `gaussian_avatars-features`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,12 +24,12 @@ from mien.avatar.ops.expression_changes import (
 )
 from mien.avatar.ops.feature_network import Layers, feature_network_reference
 from mien.avatar.schedules import Progress, Rate
-from mien.errors import UserError
 from mien.formats.shared.packed import pack
 from mien.gaussians import Gaussians
 from mien.runtime.checks import baked_fault
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
+from refusals import refuses
 from toy_scene import random, runtime_face, toy_camera, toy_face, toy_face_model
 
 BASES = ("color_basis", "opacity_basis", "offset_basis")
@@ -62,9 +60,6 @@ def test_activations_follow_training_within_its_range_and_stop_soon_after() -> N
     assert torch.equal(within_seen(lengths[:, None] * along, seen[:0]), lengths[:, None] * along)
     inputs = torch.cat([lengths[1:4, None] * along, torch.tensor([[-4.0, 0.5], [2.0, 3.0]])]).double() + 0.01
     assert torch.autograd.gradcheck(lambda x: within_seen(x, seen.double()), inputs.requires_grad_())
-
-
-def test_frames_of_training_are_not_shortened() -> None:
     activations = random(200, 4)
     seen = outermost(activations)
     assert len(seen) < 100
@@ -154,16 +149,11 @@ def test_impossible_changes_are_refused() -> None:
         assert part in known(baked_fault(replace(baked, changes=replace(changes, **wrong))))
 
 
-# -- features on Gaussians --------------------------------------------------------------------------------------------
-
 RANK, DIRECTIONS = 3, 5
 CONFIG = plain_gaussian_avatars(
-    expression_rank=RANK,
-    expression_color_rate=Rate(0.0),
-    appearance="features",
-    appearance_directions=DIRECTIONS,
+    expression_rank=RANK, expression_color_rate=Rate(0.0), appearance="features", appearance_directions=DIRECTIONS,
     appearance_features=6,
-)
+)  # fmt: skip
 
 
 def with_features(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True) -> GaussianAvatars:
@@ -175,17 +165,24 @@ def with_features(config: GaussianAvatarsConfig = CONFIG, *, filled: bool = True
         for name in set(avatar.store.names()) & {"feature_bases", "neutral_features", "offset_basis", "opacity_basis"}:
             avatar.store.assign(name, 0.3 * torch.randn(avatar.store[name].shape))
         with torch.no_grad():
-            assert avatar.appearance is not None
-            avatar.appearance.last.weight.normal_(0, 0.3)
+            known(avatar.appearance).last.weight.normal_(0, 0.3)
     return avatar
 
 
-def test_starts_as_without_features() -> None:
+def test_an_avatar_starts_as_without_features_and_changes_with_them_have_a_penalty() -> None:
     plain = plain_gaussian_avatars(expression_rank=RANK, expression_color_rate=Rate(0.0))
     torch.manual_seed(0)
     static = GaussianAvatars(plain, toy_face_model(), toy_face(5))
     ours, theirs = (avatar.pose(toy_face(5)).gaussians for avatar in (with_features(filled=False), static))
     assert all(torch.equal(getattr(ours, part), getattr(theirs, part)) for part in PARTS)
+    avatar = with_features(replace(CONFIG, appearance_weight=0.5))
+    for name in ("feature_bases", "neutral_features"):
+        avatar.store[name].data[0] = 0
+    posed = avatar.pose(toy_face(5)[1])
+    changes = [posed.aux[name] for name in ("feature_color", "feature_opacity")]
+    assert all(not each[0].any() and each[1].any() for each in changes)
+    losses = avatar.regularizers(posed, pictured(len(avatar.store)), Progress(0, 1))
+    torch.testing.assert_close(losses["appearance"], 0.5 * sum(each.square().mean() for each in changes))
 
 
 def test_color_and_opacity_change_by_the_network() -> None:
@@ -219,17 +216,6 @@ def test_baked_avatars_pose_alike_far_from_what_was_filmed(settings: dict[str, R
     assert pack(portable), "a page holds them"
 
 
-def test_a_gaussian_without_features_never_changes_and_changes_have_a_penalty() -> None:
-    avatar = with_features(replace(CONFIG, appearance_weight=0.5))
-    for name in ("feature_bases", "neutral_features"):
-        avatar.store[name].data[0] = 0
-    posed = avatar.pose(toy_face(5)[1])
-    changes = [posed.aux[name] for name in ("feature_color", "feature_opacity")]
-    assert all(not each[0].any() and each[1].any() for each in changes)
-    losses = avatar.regularizers(posed, pictured(len(avatar.store)), Progress(0, 1))
-    torch.testing.assert_close(losses["appearance"], 0.5 * sum(each.square().mean() for each in changes))
-
-
 def test_features_have_their_own_number_of_activations() -> None:
     avatar = with_features()
     assert avatar.store["feature_bases"].shape[1] == DIRECTIONS
@@ -253,6 +239,5 @@ def test_features_have_their_own_number_of_activations() -> None:
     alone.check()
     assert baked_fault(with_features(alone).bake()) is None
     few = replace(GaussianAvatarsConfig(), appearance_directions=3, expression_rank=4)
-    with pytest.raises(UserError, match=r"--method.appearance-directions 3: .* --method.expression-rank 4"):
-        few.check()
+    refuses(r"--method.appearance-directions 3: .* --method.expression-rank 4", few.check)
     replace(few, appearance_directions=4).check()

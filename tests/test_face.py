@@ -52,7 +52,7 @@ def someone(model: FaceModel, seed: int = 0) -> Tensor:
     return torch.randn(model.identity_basis.shape[0], generator=torch.Generator().manual_seed(seed))
 
 
-def test_shapes_and_sizes_are_the_documented_ones(model):
+def test_shapes_sizes_and_windings_are_the_documented_ones(model):
     v = len(model.template)
     assert 4000 < v < 5000
     assert 8000 < len(model.faces) < 9500
@@ -71,9 +71,6 @@ def test_shapes_and_sizes_are_the_documented_ones(model):
     assert 0.055 < left[0] - right[0] < 0.07
     template = model.template.double()  # in float32, differences of nearly equal points are noise
     assert torch.cdist(template * torch.tensor([-1.0, 1.0, 1.0]), template).min(1).values.max() < 1e-5
-
-
-def test_faces_are_counter_clockwise_seen_from_outside(model):
     corners = model.template[model.faces]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     for joint in ("left_eye", "right_eye"):
@@ -91,7 +88,7 @@ def test_faces_are_counter_clockwise_seen_from_outside(model):
     assert brows[..., 1].min() > lips[..., 1].max()
 
 
-def test_lower_teeth_follow_the_jaw_rigidly(model):
+def test_lower_teeth_follow_the_jaw_rigidly_and_the_tongue_lies_below_the_upper_ones(model):
     identity = someone(model)
     rest, opened = (model(posed(model, identity, jawOpen=value))[0] for value in (0.0, 1.0))
     teeth = vertices_of(model, "teeth")
@@ -113,6 +110,17 @@ def test_lower_teeth_follow_the_jaw_rigidly(model):
     moving = {name for name, amount in zip(model.expression_names, amounts, strict=True) if amount > 0}
     assert moving == {"jawOpen", "jawForward", "jawLeft", "jawRight"}
     assert not model.joint_rotation_basis[:, torch.arange(len(model.joint_names)) != jaw].any()
+    teeth = vertices_of(model, "teeth")
+    upper = model.template[teeth[model.skinning_weights[teeth, model.joint_names.index("jaw")] < 0.5]]
+    tongue = model.template[vertices_of(model, "tongue")]
+    assert tongue[:, 1].max() < upper[:, 1].min()
+    assert tongue[:, 2].max() < upper[:, 2].max() - 0.008
+    # The collar has no steps: each vertex lies between its two neighbours. A step would be a corner.
+    points = model.template[bottom_vertices(model)]
+    distance = torch.cdist(points, points).fill_diagonal_(torch.inf)
+    first, second = (points[index] for index in distance.topk(2, largest=False).indices.T)
+    assert torch.nn.functional.cosine_similarity(first - points, second - points, dim=1).max() < -0.9
+    assert points[:, 0].abs().max() < 0.11
 
 
 @pytest.mark.parametrize("side", ["left_eye", "right_eye"])
@@ -135,7 +143,7 @@ def test_an_eye_turns_about_its_own_center(model, side):
     torch.testing.assert_close(turned[far], rest[far], atol=TOLERANCE, rtol=0)
 
 
-def test_lids_follow_the_gaze_and_no_expression_does_it_twice(model):
+def test_lids_follow_the_gaze_and_a_full_blink_closes_the_eye_and_no_more(model):
     ahead, down, up = (model(posed(model, left_eye=(a, 0.0, 0.0), right_eye=(a, 0.0, 0.0)))[0] for a in (0, 0.3, -0.3))
     lids = vertices_of(model, "eyelids")
     upper = lids[(ahead[lids][:, 1] > 0.003) & (ahead[lids][:, 2] > 0.085)]
@@ -158,6 +166,14 @@ def test_lids_follow_the_gaze_and_no_expression_does_it_twice(model):
     assert rigid_residual(rest[base], bent[base]) < 1e-4
     face = vertices_of(model, "lips", "eyes", "nose", "ears", "teeth", "tongue")
     torch.testing.assert_close(bent[face], rest[face], atol=TOLERANCE, rtol=0)
+    ahead, nearly, full = (model(posed(model, eyeBlinkLeft=amount, eyeBlinkRight=amount))[0] for amount in (0, 0.85, 1))
+    opened = _seen_of_eyes(model, ahead)
+    assert opened > 5000
+    assert 0.01 * opened < _seen_of_eyes(model, nearly) < 0.1 * opened
+    assert _seen_of_eyes(model, full) < 0.001 * opened
+    marks = model.landmark_positions(full, "mediapipe")
+    upper, lower = marks[[387, 386, 385, 160, 159, 158], 1], marks[[373, 374, 380, 144, 145, 153], 1]
+    assert (upper - lower).min() > -0.0006  # they do not run through each other
 
 
 def test_landmarks_lie_on_the_right_places(model):
@@ -188,33 +204,6 @@ def _seen_of_eyes(model: FaceModel, vertices: Tensor) -> int:
     eyes = model.region_mask("eyes", "irises").nonzero()[:, 0]
     return int(torch.isin(found, eyes.to(found.dtype)).sum())
 
-
-def test_a_full_blink_closes_the_eye_and_no_more(model):
-    ahead, nearly, full = (model(posed(model, eyeBlinkLeft=amount, eyeBlinkRight=amount))[0] for amount in (0, 0.85, 1))
-    opened = _seen_of_eyes(model, ahead)
-    assert opened > 5000
-    assert 0.01 * opened < _seen_of_eyes(model, nearly) < 0.1 * opened
-    assert _seen_of_eyes(model, full) < 0.001 * opened
-    marks = model.landmark_positions(full, "mediapipe")
-    upper, lower = marks[[387, 386, 385, 160, 159, 158], 1], marks[[373, 374, 380, 144, 145, 153], 1]
-    assert (upper - lower).min() > -0.0006  # they do not run through each other
-
-
-def test_the_tongue_lies_below_the_upper_teeth(model):
-    teeth = vertices_of(model, "teeth")
-    upper = model.template[teeth[model.skinning_weights[teeth, model.joint_names.index("jaw")] < 0.5]]
-    tongue = model.template[vertices_of(model, "tongue")]
-    assert tongue[:, 1].max() < upper[:, 1].min()
-    assert tongue[:, 2].max() < upper[:, 2].max() - 0.008
-    # The collar has no steps: each vertex lies between its two neighbours. A step would be a corner.
-    points = model.template[bottom_vertices(model)]
-    distance = torch.cdist(points, points).fill_diagonal_(torch.inf)
-    first, second = (points[index] for index in distance.topk(2, largest=False).indices.T)
-    assert torch.nn.functional.cosine_similarity(first - points, second - points, dim=1).max() < -0.9
-    assert points[:, 0].abs().max() < 0.11
-
-
-# Principal components of people ---------------------------------------------------------------------------------------
 
 DIRECTIONS = 4
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from known import known
 from mien.camera import camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model, loading
 from mien.face.parts import part_boxes
@@ -78,8 +79,7 @@ def test_the_last_persons_shape_is_not_taken_for_anothers() -> None:
     for other in (doubled, replace(face, identity=-face.identity), replace(face, vertex_offsets=None)):
         torch.testing.assert_close(model(other), model.vertices_reference(other), atol=1e-6, rtol=0)
     # A shape that was looked at without gradients still has them.
-    assert face.vertex_offsets is not None
-    shape = [face.identity.requires_grad_(), face.vertex_offsets.requires_grad_()]
+    shape = [face.identity.requires_grad_(), known(face.vertex_offsets).requires_grad_()]
     with torch.no_grad():
         model(face)
     for gradient in torch.autograd.grad(model(face).square().sum(), shape):
@@ -114,8 +114,6 @@ def test_more_blendshapes_than_the_core_takes_are_posed_by_the_reference() -> No
     face = random_face(model, 2)
     assert torch.equal(model(face), model.vertices_reference(face))
 
-
-# Boxes of eyes and mouth ----------------------------------------------------------------------------------------------
 
 CAMERA = camera_from_fov(0.5, 200, 160, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
 
@@ -160,9 +158,6 @@ def test_parts_that_face_away_or_are_outside_are_missing(face_model: FaceModel) 
     left, _, width, _ = part_boxes(face_model, placed(face_model, shift=(0.14, 0, -0.6)), CAMERA)["mouth"]
     assert left + width == CAMERA.width, "it is cut at the border"
     assert part_boxes(replace(face_model, region_names=("skin", "a", "b")), placed(face_model), CAMERA) == {}
-
-
-# Landmarks ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_point_on_the_surface_is_found_again():

@@ -43,7 +43,7 @@ def correct(track: FaceTrack, tracked: FaceParams, index: int, shift: torch.Tens
         moments.step += 1
 
 
-def test_face_track_moves_only_the_timestep_that_was_used() -> None:
+def test_face_track_moves_only_the_timestep_that_was_used_within_its_bounds() -> None:
     start, adam = toy_face(6), Adam()
     track = FaceTrack(start, FaceTuning(enabled=True, expression=Rate(0.01)))
     for step in range(4):
@@ -63,9 +63,6 @@ def test_face_track_moves_only_the_timestep_that_was_used() -> None:
     still = FaceTrack(start, FaceTuning(enabled=False))
     assert not still.face(2).expression.requires_grad
     assert (still.parameter_groups(2), still.state()) == ([], {})
-
-
-def test_tuned_expressions_stay_within_their_bounds_or_where_they_were_tracked() -> None:
     start, adam = toy_face(6), Adam()
     bounds = torch.tensor([[0.0, 1.0], [0.3, 0.4]])
     assert float(start.expression[0, 1]) < 0.3
@@ -80,7 +77,7 @@ def test_tuned_expressions_stay_within_their_bounds_or_where_they_were_tracked()
         torch.testing.assert_close(track.face(0).expression[0].detach(), expected)
 
 
-def test_corrections_spread_to_timesteps_that_were_not_seen() -> None:
+def test_corrections_spread_within_their_sequence_and_a_held_out_one_gets_the_mean_of_the_pose() -> None:
     tracked = torch.arange(12.0).reshape(6, 2)
     seen = torch.tensor([False, True, False, False, True, False])
     correction = torch.tensor([[0.0, 0.0], [1.0, -2.0], [0.0, 0.0], [0.0, 0.0], [4.0, 1.0], [0.0, 0.0]])
@@ -88,10 +85,7 @@ def test_corrections_spread_to_timesteps_that_were_not_seen() -> None:
     spread_corrections(tuned, tracked, seen)
     expected = torch.tensor([[1.0, -2.0], [1.0, -2.0], [2.0, -1.0], [3.0, 0.0], [4.0, 1.0], [4.0, 1.0]])
     torch.testing.assert_close(tuned - tracked, expected)
-
-
-def test_corrections_of_a_timestep_stay_within_its_sequence() -> None:
-    """Timestep 1 takes them from timestep 0; the third sequence, which is trained as well, does not."""
+    # Timestep 1 takes them from timestep 0; the third sequence, which is trained as well, does not.
     track = FaceTrack(still_face(6), FaceTuning(enabled=True), lengths=(2, 2, 2))
     assert [track.index_of(sequence, timestep) for sequence in (0, 1, 2) for timestep in (0, 1)] == list(range(6))
     push(track, 0, 1.0)
@@ -99,10 +93,7 @@ def test_corrections_of_a_timestep_stay_within_its_sequence() -> None:
     moved = track.params().head_translation
     assert (moved[0] < 0).all()
     torch.testing.assert_close(moved, moved[0] * torch.tensor([1, 1, 0, 0, -1, -1])[:, None])
-
-
-def test_a_held_out_sequence_gets_the_mean_correction_of_the_pose() -> None:
-    """The head of sequence 0 looks ahead, that of sequence 1, which is held out, looks aside: forward is sideways."""
+    # The head of sequence 0 looks ahead, that of sequence 1, which is held out, looks aside: forward is sideways.
     aside = torch.zeros(3, 3)
     aside[2, 1] = torch.pi / 2
     face = still_face(3, head_rotation=aside)
@@ -160,6 +151,21 @@ def test_corrections_that_follow_the_turns_are_taken_away(keeps: bool, mean: boo
     assert float(moved.norm(dim=1).max()) == pytest.approx(0.0 if keeps else 0.0014, abs=5e-5)
     assert float(tuned.mean()) == pytest.approx(0.0 if mean else 0.01 + 0.02 / 41, abs=1e-4)
     assert float(tuned[20] - tuned[19]) == pytest.approx(0.02, abs=1e-3), "a timestep's own correction stays"
+
+
+def test_what_is_not_trained_on_moves_no_other_pose_and_loses_the_same() -> None:
+    """The last head is not trained on, and is then turned and corrected in another way."""
+    angles, found = torch.linspace(-0.35, 0.35, 21), []
+    for last, slope in ((0.35, 0.05), (2.0, -0.5)):
+        heads = torch.cat([angles[:20], torch.tensor([last])])
+        tracked = still_face(len(heads), head_rotation=torch.stack([2 * heads**2, heads, 0 * heads], 1))
+        track = FaceTrack(tracked, FaceTuning(enabled=True, keep_mean_pose=True, keep_turns=True), trained=range(20))
+        for index, angle in enumerate(heads.tolist()):
+            correct(track, tracked, index, torch.zeros(3), 0.01 + (0.05 if index < 20 else slope) * angle)
+        track.steady_pose()
+        found.append(torch.cat([track.face(index).head_rotation.detach() for index in range(21)])[:, 1] - heads)
+    assert found[0][:20].equal(found[1][:20])
+    assert float(found[0].abs().max()) < 1e-3, "the last one followed its turn as well"
 
 
 def test_aligned_faces_are_corrected_more_slowly() -> None:

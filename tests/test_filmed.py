@@ -1,4 +1,4 @@
-"""Driving keeps softly to the expressions and poses that training saw; sheets show every expression or side once."""
+"""Driving keeps to what training saw; films and `unseen_view` turn to the sides that were filmed, and beside them."""
 
 import math
 import shutil
@@ -11,18 +11,24 @@ import pytest
 import torch
 
 import train_toy
+from known import known
 from mien import runtime
 from mien.avatar import Avatar, load_avatar
 from mien.avatar.baking import make_portable
 from mien.avatar.files import write_avatar
 from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.camera import Camera, camera_from_fov
+from mien.camera import Camera, camera_from_fov, look_at
 from mien.cli import main
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.motion import ARKIT_NAMES
-from mien.errors import UserError
+from mien.evaluation import living
+from mien.evaluation.living import Living
 from mien.face import FaceModel, FaceParams, load_face_model
+from mien.lab.benchmarking.quality import unseen_lines
+from mien.lab.benchmarking.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
+from mien.lab.synthetic.recipe import SIDES
+from mien.lab.synthetic.references import REFERENCES
 from mien.pipeline import drive as driving
 from mien.pipeline.sheets import TURNTABLE_TILES, Tile, expression_tiles, filmed_tiles, nearer_tiles, turntable_tiles
 from mien.pipeline.view import viewed_file
@@ -32,10 +38,11 @@ from mien.runtime.baked import Filmed
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
 from mien.training.footage.filmed import FILE, read_coverage
 from plain_settings import plain_config
-from shared_things import toy_workspace
+from refusals import complaint, refuses
+from shared_things import toy_workspace, write_toy_workspace
 from small_face_model import make_small_face_model
 from toy_scene import toy_camera, toy_face_model, toy_sequence
-from toy_workspace import write_toy_workspace
+from web_case import drawn_head
 
 EYE = np.array([0.0, 0.0, 1.0])
 PARTS = ("lowest", "highest", "directions", "reach", "head_angles")
@@ -65,7 +72,7 @@ def _written(path: Path, avatar: Avatar, **changes: object) -> runtime.PortableA
     return runtime.read_portable(path)
 
 
-def test_soft_limits_change_nothing_inside_and_stay_below_their_limit() -> None:
+def test_limits_are_soft_and_a_rare_combination_becomes_weaker_and_keeps_its_kind() -> None:
     values = np.linspace(-5, 5, 1001)
     limited = soft_limits(values, np.array(-1.0), np.array(2.0), np.array(0.0), 1e-6)
     inside = (values >= -1) & (values <= 2)
@@ -75,10 +82,7 @@ def test_soft_limits_change_nothing_inside_and_stay_below_their_limit() -> None:
     assert (slopes > 0).all(), "more motion of the driver is never less of the avatar"
     assert slopes.max() < 1 + 1e-9
     assert np.abs(np.diff(slopes)).max() < 0.08, "no kink"
-
-
-def test_a_rare_combination_becomes_weaker_and_keeps_its_kind() -> None:
-    """Either of two expressions was filmed at 1, never both together."""
+    # Either of two expressions was filmed at 1, never both together.
     single = torch.cat([torch.eye(3)[:2].repeat(20, 1), torch.zeros(20, 3)])
     inputs = np.zeros((3, 9), np.float32)
     inputs[0, 0], inputs[1, :2], inputs[2, 2] = 1.0, 1.0, 1.5
@@ -144,10 +148,8 @@ def test_it_is_kept_in_a_run_and_in_a_mien_file_and_checked(tmp_path: Path) -> N
     ):
         avatar.filmed = replace(good, **change)
         write_avatar(tmp_path / "a", avatar)
-        with pytest.raises(UserError, match="filmed"):
-            load_avatar(tmp_path / "a")
-        with pytest.raises(UserError, match="filmed"):
-            _written(tmp_path / "a.mien", avatar)
+        refuses("filmed", load_avatar, tmp_path / "a")
+        refuses("filmed", _written, tmp_path / "a.mien", avatar)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -155,13 +157,11 @@ def test_a_confidence_that_does_not_fit_is_refused(method: str, tmp_path: Path) 
     avatar = _avatar(toy_sequence()[1].tracking.face, method)
     good = np.full(len(toy_face_model().faces), 0.5, np.float32)
     found = _written(tmp_path / "a.mien", avatar, confidence=good)
-    assert found.confidence is not None
-    assert np.array_equal(found.confidence, good)
+    assert np.array_equal(known(found.confidence), good)
     wrong = [good + 1, good - 1, good * np.float32("nan")]
     wrong += [good[1:], good[:0]] if isinstance(found.baked, runtime.MeshBound) else []
     for confidence in wrong:
-        with pytest.raises(UserError, match="confidence"):
-            _written(tmp_path / "a.mien", avatar, confidence=confidence)
+        refuses("confidence", _written, tmp_path / "a.mien", avatar, confidence=confidence)
 
 
 @pytest.mark.unchecked
@@ -169,13 +169,11 @@ def test_a_mien_file_and_the_viewer_have_the_confidence_of_the_run(tmp_path: Pat
     monkeypatch.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, steps=2, unseen="filled"))
     write_toy_workspace(tmp_path / "me")
     run, path = tmp_path / "me" / "runs" / "toy", tmp_path / "me.mien"
-    covered = read_coverage(run, load_avatar(run).face_model)
-    assert covered is not None
+    covered = known(read_coverage(run, load_avatar(run).face_model))
     assert covered.seen.unique().numel() > 1
     export = ["export", str(tmp_path / "me"), "--out", str(path)]
     assert main(export) == 0
-    mesh = viewed_file(path).mesh
-    assert mesh is not None
+    mesh = known(viewed_file(path).mesh)
     for found in (runtime.read_portable(path).confidence, mesh.seen):
         assert found is not None
         assert np.array_equal(found, covered.seen.numpy())
@@ -190,7 +188,7 @@ CAMERA = toy_camera(32)
 workspace = pytest.fixture(toy_workspace)
 
 
-def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
+def test_every_expression_has_a_tile_whose_strength_is_relative_to_what_was_filmed() -> None:
     model = load_face_model("anny")
     face = model.neutral()
     tiles = expression_tiles(model, face, CAMERA, 1.0)
@@ -206,9 +204,6 @@ def test_every_expression_that_the_face_model_shows_has_a_tile() -> None:
             assert not tile.face.joints.any(), name
     strong = {tile.name for tile in expression_tiles(model, face, CAMERA, 1.5)}
     assert {"jawOpen 1.20", "browInnerUp 1.50"} <= strong, "coefficients stay within the bounds of the face model"
-
-
-def test_strengths_relative_to_what_was_filmed() -> None:
     model = make_small_face_model()
     count = len(model.expression_names)
     model = replace(model, expression_bounds=torch.tensor([[0.0, 1.0]]).repeat(count, 1))
@@ -217,9 +212,6 @@ def test_strengths_relative_to_what_was_filmed() -> None:
     tiles = filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
     shown = [float(tile.face.expression.max()) for tile in tiles[1:]]
     assert shown == pytest.approx([min(1.5 * value, 1.0) for value in highest[:count][::-1].tolist()])
-
-
-def test_a_turntable_ends_at_half_of_its_angle_on_either_side() -> None:
     face, center = make_small_face_model().neutral(), torch.zeros(3)
     tiles, around = (turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))
     assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "front", "+60 degrees"]
@@ -253,23 +245,18 @@ def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
 def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: list[str]) -> None:
     out = tmp_path / "sheet.png"
     assert main(["render", str(workspace), "--out", str(out), "--size", "32", "--sheet", *options]) == 0
-    sheet = cv2.imread(str(out))
-    assert sheet is not None
+    sheet = known(cv2.imread(str(out)))
     assert sheet.shape[1] % 36 == 32 or sheet.shape[1] == 32
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
 
 
-def test_a_sheet_without_a_name_lies_in_the_runs_folder(workspace: Path, tmp_path: Path, capsys) -> None:
+def test_a_sheet_lies_in_the_runs_folder_and_what_is_beyond_the_film_is_told(workspace, tmp_path, capsys) -> None:
     """Other pictures need a name, because it says what they are."""
     render = ["render", str(shutil.copytree(workspace, tmp_path / "W")), "--size", "32"]
     assert main([*render, "--sheet", "turntable"]) == 0
     (sheet,) = (tmp_path / "W/runs").glob("*/sheet_turntable.png")
     assert f"{sheet}: 9 pictures" in capsys.readouterr().err
-    assert main(render) == 2
-    assert "--out: is missing" in capsys.readouterr().err
-
-
-def test_what_is_beyond_the_film_is_told_and_softened(workspace: Path, tmp_path: Path, capsys) -> None:
+    assert "--out: is missing" in complaint(capsys, *render)
     still = ["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "32"]
     for value, told in ((1, True), (0, False)):
         assert main([*still, "--set", f"drop={value}"]) == 0
@@ -295,3 +282,95 @@ def test_a_driver_who_goes_far_is_softened_unless_asked(workspace: Path, tmp_pat
         assert ("5 of 5 frames go beyond what was filmed and are softened" in told) == softens
     for near, wild in zip(*looked_up.values(), strict=True):
         assert float(near[1, 2]) < float(wild[1, 2]) - 0.3, "the head looks up less"
+
+
+def test_views_begin_at_the_tracked_camera_and_show_moments_of_the_held_out_sequence() -> None:
+    """Whatever the tracked face, focal length and distance are, the avatar is seen as it was trained."""
+    own = _camera(0.48, (0.02, 0.1, 0.8))
+    front = Front(_camera(0.5, (0.0, 0.1, 0.9)), own, np.array([0.01, 0.0, 0.02]), np.array([0.03, -0.01, 0.05]))
+    placed = camera_beside(front.true, front)
+    torch.testing.assert_close(placed.viewmat, own.viewmat)
+    torch.testing.assert_close(placed.K, own.K)
+    # The side views are those timesteps of the sequence, in the front camera as well, and no one else's.
+    reference = REFERENCES["mono-sides"]
+    assert known(reference.views).sequence in reference.held_out_sequences
+    front, aside, views = reference.tiny().scenes()
+    for index, timestep in enumerate(known(views.moments)):
+        torch.testing.assert_close(views.vertices(index), aside.vertices(timestep))
+    assert not torch.equal(front.vertices(0), aside.vertices(0))
+    assert len(views.cameras) == len(SIDES) + 1
+    torch.testing.assert_close(views.cameras[0].viewmat, aside.camera.viewmat)
+
+
+def test_a_camera_aside_sees_a_true_tracking_where_it_sees_the_person() -> None:
+    """The tracked world is turned, moved and a tenth larger; through the placed camera every point is at its pixel."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    turn = matrix_from_axis_angle(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)).numpy()
+    shift = np.array([0.05, -0.02, 0.3])
+    tracked = 1.1 * points @ turn.T + shift
+    true = _camera(0.5, (0.0, 0.1, 0.9))
+    view = true.viewmat.double().numpy()
+    moved = np.eye(4)
+    moved[:3, :3] = view[:3, :3] @ turn.T
+    moved[:3, 3] = 1.1 * view[:3, 3] - moved[:3, :3] @ shift
+    own = replace(true, viewmat=torch.from_numpy(moved).float())
+    front = Front(true, own, points.mean(0), tracked.mean(0))
+    assert front.scale == pytest.approx(1 / 1.1)
+    behind = front.behind(np.array([0.0, 0.6, 0.8]))
+    expected = 1.1 * (points.mean(0) - 0.08 * np.array([0.0, 0.6, 0.8])) @ turn.T + shift
+    np.testing.assert_allclose(behind.tracked_middle, expected, atol=1e-6)
+    aside = _camera(0.5, (0.5, 0.1, 0.7))
+    placed = camera_beside(aside, behind)
+    seen, _ = placed.project(torch.from_numpy(tracked).float())
+    expected, _ = aside.project(torch.from_numpy(points).float())
+    torch.testing.assert_close(seen, expected, atol=1e-2, rtol=0)
+    torch.testing.assert_close(placed.viewmat[:3, :3] @ placed.viewmat[:3, :3].T, torch.eye(3), atol=1e-5, rtol=0)
+
+
+def _camera(field_of_view: float, place: tuple[float, float, float]) -> Camera:
+    viewmat = look_at(torch.tensor(place), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    return camera_from_fov(field_of_view, 320, 320, viewmat)
+
+
+def test_table_and_chart(tmp_path) -> None:  # noqa: ANN001
+    names = list(dict.fromkeys(angle_names()))
+    assert names == ["front", "15", "30", "45", "60", "90", "180", "above 25", "below 25"]
+    figures = {"psnr": 20.0, "ssim": 0.5, "l1": 0.1, "perceptual": 0.25}
+    unknown = {**figures, "head": {**figures, "perceptual": None}}
+    rows = {name: {"avatar": {**figures, "head": figures}, "mesh": unknown} for name in names}
+    assert unseen_lines("mono-sides", rows)[3] == "| 15 | 20.00 / 0.500 / 0.250 | 20.00 / 0.500 / - |"
+    write_unseen_chart(tmp_path / "chart.png", rows)
+    assert (tmp_path / "chart.png").stat().st_size > 1000
+    assert REFERENCES["ring-16"].views is None
+
+
+DEGREES = np.degrees(1.0)
+
+
+avatar = pytest.fixture(lambda: runtime.Avatar(drawn_head(1500)))
+
+
+def aside(avatar: runtime.Avatar, degrees: float) -> runtime.Avatar:
+    """The avatar of a person whose head, at rest, is turned to its left."""
+    portable = avatar.portable
+    turned = living.turned_head(avatar, degrees / DEGREES, 0.0)
+    return runtime.Avatar(replace(portable, neutral=replace(portable.neutral, head_rotation=turned)))
+
+
+def test_the_head_turns_to_the_sides_that_were_filmed_and_never_leaves_the_film(avatar: runtime.Avatar, monkeypatch):
+    # The head of the drawn person looks 5.1 degrees to its right of the camera.
+    assert np.multiply(living.yaws_of(aside(avatar, 5.1), (15, 10)), DEGREES) == pytest.approx((-10, 15), abs=0.1)
+    # A camera that sees its right already leaves less on that side.
+    assert np.multiply(living.yaws_of(aside(avatar, 10.1), (15, 10)), DEGREES) == pytest.approx((-15, 10), abs=0.1)
+    assert living.yaws_of(avatar, (0, 0)) == (-living.LEAST_YAW, living.LEAST_YAW)
+    assert living.yaws_of(avatar, (180, 180)) == living.yaws_of(avatar, None) == (-living.MOST_YAW, living.MOST_YAW)
+    yaws = (-0.1, 0.4)
+    monkeypatch.setattr(living, "FPS", 4)
+    pictures = np.stack(list(living.pictures_of(Living(avatar, living.near_camera(avatar, yaws), yaws))))
+    drawn = pictures.min(-1) < 200
+    rows, columns = np.flatnonzero(drawn.max((0, 2))), np.flatnonzero(drawn.max((0, 1)))
+    for ends in (rows, columns):
+        assert ends[0] > 0
+        assert ends[-1] < living.SIDE - 1
+    assert max(np.ptp(rows), np.ptp(columns)) > 0.8 * living.SIDE
+    assert np.mean(pictures[0] != pictures[5]) > 0.1, "the head turns"

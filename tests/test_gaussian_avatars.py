@@ -1,26 +1,29 @@
-"""GaussianAvatars' formulas. Gaussians stay on the surface, within limits to their place, size and tilt."""
+"""GaussianAvatars' formulas: triangle frames are right, and Gaussians stay on the surface, within limits."""
 
 import math
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
+from instruction_sets import by_threads
 from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars, never_empty_a_triangle
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface, limits_of_triangles
-from mien.avatar.ops.triangle_frames import bind_to_world, triangle_ellipses
+from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
+from mien.avatar.ops.skin_points import blend_transforms, unskin
+from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, triangle_ellipses, triangle_frames
 from mien.avatar.schedules import Progress
 from mien.avatar.store import GaussianStore
-from mien.face import FaceModel
-from mien.gaussians import world_means
+from mien.face import FaceModel, FaceParams
+from mien.gaussians import Gaussians, world_means
 from mien.render import rasterize
-from mien.rotation import matrix_from_quaternion
+from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of, toy_camera, toy_face, toy_face_model
+from toy_scene import rgb_from_sh, surface_of, toy_camera, toy_face, toy_face_model
 
 
 def new_avatar(config: GaussianAvatarsConfig | None = None, face_model: FaceModel | None = None) -> GaussianAvatars:
@@ -68,14 +71,10 @@ def test_losses_are_those_of_the_paper() -> None:
         assert [losses[name].item() for name in ("position", "scale")] == pytest.approx([position, scale], rel=1e-5)
 
 
-def test_sh_degrees_are_switched_on_one_after_the_other() -> None:
+def test_sh_degrees_are_switched_on_one_after_the_other_and_may_turn_with_the_head() -> None:
     avatar, face = new_avatar(plain_gaussian_avatars(sh_degree=3, sh_warmup=0.4)), toy_face(5)[0]
     counts = [avatar.pose(face, Progress(step, 100)).gaussians.sh.shape[-2] for step in (0, 9, 10, 20, 31, 99)]
-    assert counts == [1, 1, 4, 9, 16, 16]
-    assert avatar.pose(face).gaussians.sh.shape[-2] == 16
-
-
-def test_head_frame_sees_the_same_picture_but_for_the_light() -> None:
+    assert (counts, avatar.pose(face).gaussians.sh.shape[-2]) == ([1, 1, 4, 9, 16, 16], 16)
     avatars = (new_avatar(plain_gaussian_avatars(sh_frame=frame)) for frame in ("world", "head"))
     drawn = (avatar.pose(toy_face(5)[1]).gaussians.timestep(0) for avatar in avatars)
     pictures = [rasterize(gaussians, toy_camera(32), torch.ones(3)).image for gaussians in drawn]
@@ -133,3 +132,146 @@ def test_ellipses_have_the_moments_of_their_triangles() -> None:
     normal = normal / normal.norm(dim=-1, keepdim=True)
     thin = torch.einsum("f,fi,fj->fij", scales[0].amin(-1) ** 2, normal, normal)
     torch.testing.assert_close(found, expected + thin, atol=1e-4, rtol=1e-3)
+
+
+def random_rig(dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return arguments of `bind_to_world`, at the size of a head."""
+    generator = torch.Generator().manual_seed(0)
+    vertices = 0.1 * torch.randn(20, 3, generator=generator, dtype=dtype)
+    faces = torch.stack([torch.randperm(20, generator=generator)[:3] for _ in range(30)])
+    face_index = torch.randint(0, 30, (100,), generator=generator)
+    means = torch.randn(100, 3, generator=generator, dtype=dtype)
+    quats = torch.randn(100, 4, generator=generator, dtype=dtype)
+    log_scales = torch.randn(100, 3, generator=generator, dtype=dtype)
+    return vertices, faces, face_index, means, quats, log_scales
+
+
+def test_a_known_triangle_has_its_frame_and_a_gaussian_at_rest_takes_it():
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0.5, 1, 0]])
+    frames = triangle_frames(vertices, torch.tensor([[0, 1, 2]]))
+    # Columns: first edge (+x), normal (+z), their cross product (-y).
+    torch.testing.assert_close(frames.R[0], torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    torch.testing.assert_close(frames.T[0], torch.tensor([2.5 / 3, 1 / 3, 0]))
+    torch.testing.assert_close(frames.k[0], torch.tensor(1.5))
+    # The native core uses each of the four quaternion formulas.
+    vertices, faces, *_ = random_rig()
+    frames, zeros = triangle_frames(vertices, faces), torch.zeros(30, 3)
+    unit, bound = torch.tensor([3.0, 0, 0, 0]).expand(30, 4), torch.arange(30)
+    for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 2e-6)):
+        local = (one.to(dtype) for one in (zeros, unit, zeros))
+        means, quats, scales = (one.double() for one in bind_to_world(vertices.to(dtype), faces, bound, *local))
+        torch.testing.assert_close(means, frames.T, atol=tolerance, rtol=0)
+        torch.testing.assert_close(matrix_from_quaternion(quats), frames.R, atol=tolerance, rtol=0)
+        torch.testing.assert_close(scales, frames.k[:, None].expand(-1, 3), atol=tolerance, rtol=0)
+        assert set(quats.abs().argmax(-1).tolist()) == {0, 1, 2, 3}
+
+
+def test_gaussians_follow_a_similarity_of_the_mesh():
+    vertices, faces, *local = random_rig()
+    rotation = matrix_from_axis_angle(torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64))
+    shift = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    means, quats, scales = bind_to_world(vertices, faces, *local)
+    moved_means, moved_quats, moved_scales = bind_to_world(2 * vertices @ rotation.T + shift, faces, *local)
+    torch.testing.assert_close(moved_means, 2 * means @ rotation.T + shift)
+    torch.testing.assert_close(matrix_from_quaternion(moved_quats), rotation @ matrix_from_quaternion(quats))
+    torch.testing.assert_close(moved_scales, 2 * scales)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_degenerate_triangles_stay_finite(dtype: torch.dtype):
+    corners = [[0, 0, 0], [0, 0, 0], [1, 1, 1], [1e-9, 0, 0], [2, 2, 2], [1, 0, 0]]
+    vertices = torch.tensor(corners, dtype=dtype, requires_grad=True)
+    # A point, an edge without a length, collinear vertices, a sliver, and a sound one.
+    faces = torch.tensor([[0, 0, 0], [0, 1, 2], [0, 2, 4], [0, 3, 2], [0, 5, 2]])
+    local = [torch.randn(5, width, dtype=dtype, requires_grad=True) for width in (3, 4, 3)]
+    found = triangle_frames(vertices, faces).k[:4]
+    torch.testing.assert_close(found, torch.full_like(found, DEGENERATE_LENGTH))
+    world = bind_to_world(vertices, faces, torch.arange(5), *local)
+    loss = torch.cat([output.square().flatten() for output in world]).sum()
+    gradients = torch.autograd.grad(loss, [vertices, *local])
+    assert all(tensor.isfinite().all() for tensor in (*world, *gradients))
+    assert gradients[0][5].abs().sum() > 0
+
+
+def test_gradients_go_only_where_they_are_wanted_and_indices_are_checked():
+    vertices, faces, face_index, *local = random_rig(dtype=torch.float32)
+    local[0].requires_grad_()
+    means, quats, scales = bind_to_world(vertices, faces, face_index, *local)
+    assert torch.autograd.grad(quats.sum(), local[0], retain_graph=True)[0].abs().max() == 0
+    assert torch.autograd.grad(means.sum() + scales.sum(), local[0])[0].abs().min() > 0
+    with pytest.raises(IndexError, match="vertex"):
+        bind_to_world(vertices, faces + 1, face_index, *local)
+    with pytest.raises(IndexError, match="face"):
+        bind_to_world(vertices, faces, face_index - 1, *local)
+
+
+def test_unskin_undoes_blended_transforms() -> None:
+    torch.manual_seed(0)
+    face = replace(toy_face(5), joints=torch.randn(5, 1, 3))
+    bones = toy_face_model().joint_transforms(face)[:, :, :3]
+    transforms, points = blend_transforms(torch.rand(20, 3).softmax(-1), bones)[2], torch.randn(20, 3)
+    moved = (transforms[:, :, :3] @ points[..., None])[..., 0] + transforms[..., 3]
+    torch.testing.assert_close(unskin(moved, transforms), points, atol=1e-5, rtol=1e-5)
+
+
+FACE_FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+STORED = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
+COUNT = 20_000
+
+
+def a_face(face_model: FaceModel) -> FaceParams:
+    generator, neutral = torch.Generator().manual_seed(3), face_model.neutral(1)
+    values = {
+        name: (0.2 * torch.randn(getattr(neutral, name).shape, generator=generator)).requires_grad_()
+        for name in FACE_FIELDS
+    }
+    return replace(neutral, **values)
+
+
+def a_store(face_model: FaceModel) -> GaussianStore:
+    generator = torch.Generator().manual_seed(4)
+    trained = {name: torch.randn(COUNT, *shape, generator=generator) for name, shape in STORED.items()}
+    face_index = torch.randint(len(face_model.faces), (COUNT,), generator=generator)
+    return GaussianStore(trained | {"sh": torch.zeros(COUNT, 1, 3)}, {"face_index": face_index})
+
+
+def results(gaussians: Gaussians, face: FaceParams, store: GaussianStore) -> list[Tensor]:
+    """Return values, and gradients of a loss that weighs every number differently."""
+    parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+    parts += [] if gaussians.T_world_local is None else [gaussians.T_world_local]
+    generator = torch.Generator().manual_seed(5)
+    loss = torch.stack([(part * torch.randn(part.shape, generator=generator)).sum() for part in parts]).sum()
+    inputs = [*(getattr(face, name) for name in FACE_FIELDS), *(store[name] for name in STORED)]
+    return [*(part.detach() for part in parts), *torch.autograd.grad(loss, inputs)]
+
+
+@pytest.mark.parametrize("in_head", [True, False])
+def test_posing_in_one_call_equals_its_parts_to_the_bit(anny: FaceModel, in_head: bool) -> None:
+    face, store = a_face(anny), a_store(anny)
+    expected = results(pose_bound_gaussians_reference(anny, face, store, store["sh"], in_head), face, store)
+    for native in by_threads(
+        lambda: results(pose_bound_gaussians(anny, face, store, store["sh"], in_head), face, store)
+    ):
+        assert all(torch.equal(one, other) for one, other in zip(native, expected, strict=True))
+        assert all(bool(tensor.abs().sum() > 0) for tensor in native)
+
+
+def test_a_new_store_and_changed_indices_are_noticed(anny: FaceModel) -> None:
+    """A fixed face gets no gradient."""
+    face, store = a_face(anny).detach(), a_store(anny)
+
+    def posed() -> Gaussians:
+        return pose_bound_gaussians(anny, face, store, store["sh"], in_head=True)
+
+    before = posed()
+    torch.testing.assert_close(before.T_world_local, face.T_world_head)
+    assert torch.autograd.grad(before.means.sum(), store["means"])[0].any()
+    store["face_index"].copy_(store["face_index"].flip(0))
+    expected = pose_bound_gaussians_reference(anny, face, store, store["sh"], in_head=True).means
+    assert torch.equal(posed().means, expected)
+    assert not torch.equal(posed().means, before.means)
+    store.select(torch.arange(100))
+    assert posed().means.shape == (1, 100, 3)
+    store["face_index"][0] = len(anny.faces)
+    with pytest.raises(IndexError, match="face"):
+        posed()

@@ -1,4 +1,6 @@
-"""Hair that no picture shows: its height from mattes' outlines, what hangs behind the neck, and strands on the back."""
+"""Hair that no picture shows, and tracked meshes that stand out beyond the mattes."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,8 +8,9 @@ import torch
 
 from mien.avatar.bound_surface import SurfacePrior
 from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
-from mien.avatar.methods import method_named
+from mien.avatar.methods import DEFAULT_METHOD, method_named
 from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
+from mien.avatar.settings import FaceTuning
 from mien.camera import camera_from_fov
 from mien.capture.capture import Capture
 from mien.face import FaceModel
@@ -17,13 +20,15 @@ from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.rotation import matrix_from_quaternion
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.tracking import Tracking
-from mien.training import PRESETS
+from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
+from mien.training.trainer import start
 from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.hair_height import hair_height, hanging_hair
-from sh_colors import rgb_from_sh
-from toy_scene import surface_of
+from mien.training.whole_head.outline_fit import fit_to_outlines, fitted_faces
+from plain_settings import plain_config, plain_run
+from toy_scene import rgb_from_sh, surface_of, toy_sequence
 
 _HAIR = 0.02
 _SIZE, _TIMESTEPS = 160, 7
@@ -98,7 +103,7 @@ def _back_hair(model: FaceModel, hanging: torch.Tensor, hair: float = _HAIR) -> 
     return back_hair(model, model.template, hair * head_parts(model).scalp.float(), hanging)
 
 
-def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
+def test_long_hair_falls_from_the_widest_part_of_the_head_if_it_hangs_at_both_sides(anny):
     middles, _, normals = triangle_geometry(anny.template, anny.faces)
     found, parts = _back_hair(anny, _beside(anny)), head_parts(anny)
     nape = (found > 0) & (normals[:, 2] < -0.8) & (middles[:, 0].abs() < 0.02)
@@ -112,9 +117,6 @@ def test_long_hair_falls_from_the_widest_part_of_the_head(anny):
     assert (cut.margins(outside[found > 0]) > 0).all(), "no hair hangs below the cut"
     shorter = _back_hair(anny, _beside(anny, low=-0.09))
     assert float(middles[found > 0][:, 1].min()) < float(middles[shorter > 0][:, 1].min()) - 0.01, "as at the sides"
-
-
-def test_hair_that_does_not_hang_at_both_sides_has_no_back_hair(anny):
     for hanging in ({"left": 0.0, "right": 0.0}, {"left": 0.05, "right": 0.005}, {"low": 1.0}):
         assert not _back_hair(anny, _beside(anny, **hanging)).any(), hanging
     assert not _back_hair(anny, _beside(anny), hair=0.0).any(), "a bald head"
@@ -145,7 +147,7 @@ def _strands(model: FaceModel) -> dict[str, torch.Tensor]:
     return strand_gaussians(model.template, model.faces, _back(model), heights, colors)
 
 
-def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
+def test_strands_cover_the_chosen_triangles_hang_in_the_surface_and_keep_their_colors(anny):
     strands, frames = _strands(anny), triangle_frames(anny.template, anny.faces)
     counts = torch.bincount(strands["face_index"], minlength=len(anny.faces)).double()
     expected = 150_000 * triangle_geometry(anny.template.double(), anny.faces)[1] * _back(anny)
@@ -173,9 +175,6 @@ def test_strands_cover_the_chosen_triangles_and_hang_in_the_surface(anny):
     none = torch.zeros(len(anny.faces), dtype=torch.bool)
     empty = strand_gaussians(anny.template, anny.faces, none, none.float(), none[:, None].expand(-1, 3).float())
     assert not any(len(values) for values in empty.values())
-
-
-def test_a_closed_head_has_strands_that_keep_their_colors(anny):
     chosen, count = _back(anny), len(anny.faces)
     config = PRESETS["standard"].config("gaussian_avatars")
     avatar = method_named("gaussian_avatars").avatar(config, anny, anny.neutral(1))
@@ -188,3 +187,83 @@ def test_a_closed_head_has_strands_that_keep_their_colors(anny):
     for _ in range(20):
         surface_of(avatar).keep_to(prior)
     assert store["sh_constant"][bald:].equal(before)
+
+
+_SLACK = 0.004
+"""Largest shift in metres where nothing is wrong: a pixel and a half. The rim of an ear is thinner than a pixel."""
+_FRAMES = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
+
+
+def _fitted(model: FaceModel, sequence: Sequence) -> torch.Tensor:
+    return fit_to_outlines(model, [sequence], [sequence.tracking.face], _FRAMES, threads=1)
+
+
+@pytest.mark.unchecked
+def test_a_skull_that_is_too_high_sinks_into_the_outline(anny: FaceModel) -> None:
+    """The face of a person whose skull is 12 mm lower than the tracked one does not move, and the skull stays round."""
+    sequence = _sequence(anny, -0.012)
+    offsets = _fitted(anny, sequence)
+
+    def outside(offsets: torch.Tensor | None) -> float:
+        """The share of the mesh's pixels that lie outside of the mattes, over all frames."""
+        out = drawn = 0
+        for frame in _FRAMES:
+            face = replace(sequence.tracking.face[frame.timestep], vertex_offsets=offsets)
+            mesh = rasterize_mesh(anny(face)[0], anny.faces, sequence.tracking.cameras[0]).face_index.numpy() >= 0
+            out += int((mesh & (sequence.capture.mattes[frame[1:]] < 128)).sum())
+            drawn += int(mesh.sum())
+        return out / drawn
+
+    before = outside(None)
+    assert before > 0.02
+    assert outside(offsets) < 0.25 * before
+    crown = anny.template[:, 1].argmax()
+    assert -0.016 < float(offsets[crown, 1]) < -0.008, "the crown sinks by what it was too high"
+    face = anny.faces[head_parts(anny).face].long().flatten()
+    assert float(offsets[face].norm(dim=1).mean()) < 0.0005
+    # Seen from the front, the crown alone is too high. From the side, it still stands out above what is around it.
+    away = anny.template - anny.template[crown]
+    beside = (away[:, 0].abs() < 0.01) & (away[:, 2].abs() > 0.03) & (away[:, 2].abs() < 0.05) & (away[:, 1] > -0.03)
+    top = away.norm(dim=1) < 0.012
+    meshes = (anny.template, anny.template + offsets)
+    old, new = (float(each[top, 1].mean() - each[beside, 1].mean()) for each in meshes)
+    assert new > 0.8 * old
+    # A frame without a person says nothing: its distances from the matte are infinite.
+    mattes = sequence.capture.mattes.copy()
+    mattes[1] = 0
+    found = _fitted(anny, replace(sequence, capture=replace(sequence.capture, mattes=mattes)))
+    assert float((found - offsets).norm(dim=1).max()) < 0.005
+    nobody = replace(sequence.capture, mattes=np.zeros_like(mattes))
+    assert not _fitted(anny, replace(sequence, capture=nobody)).any()
+
+
+def test_hair_draws_nothing_and_offsets_that_tracking_found_are_kept(anny: FaceModel) -> None:
+    sequence, own = _sequence(anny, 0.03), torch.full_like(anny.template, 0.001)
+    tracking = replace(sequence.tracking, face=replace(sequence.tracking.face, vertex_offsets=own))
+    assert float((_fitted(anny, replace(sequence, tracking=tracking)) - own).norm(dim=1).max()) < _SLACK
+
+
+@pytest.mark.parametrize(("mesh", "unseen", "bound", "fits"), [
+    ("fitted", "filled", True, True), ("fitted", "trained", True, True), ("auto", "filled", True, True),
+    ("auto", "trained", True, False), ("tracked", "filled", True, False), ("fitted", "filled", False, False),
+])  # fmt: skip
+def test_which_meshes_are_fitted(mesh, unseen, bound: bool, fits: bool) -> None:
+    model, sequence = toy_sequence(timesteps=3, size=32)
+    settings = TrainSettings(mesh=mesh, unseen=unseen)
+    faces = fitted_faces(model, [sequence], [Frame(0, 0, 0)], settings, bound=bound)
+    assert (faces is not None) is fits
+
+
+def test_training_starts_from_the_fitted_mesh() -> None:
+    model, sequence = toy_sequence(timesteps=3, size=32)
+    config = plain_config(DEFAULT_METHOD, face_tuning=FaceTuning(enabled=True))
+    # Nobody is in the pictures, so every vertex is drawn to the nearest pixel of a person in a corner.
+    mattes = np.zeros_like(sequence.capture.mattes)
+    mattes[:, :, :8, :8] = 255
+    away = Sequence(sequence.name, replace(sequence.capture, mattes=mattes), sequence.tracking, sequence.scoring)
+    state = start([away], model, config, plain_run(mesh="fitted", split="none"))
+    offsets = state.avatar.subject.vertex_offsets
+    assert offsets is not None
+    assert float(offsets.norm(dim=1).max()) > 0.002
+    assert state.track.face(1).vertex_offsets is not None
+    assert torch.equal(state.track.params().vertex_offsets, offsets)  # type: ignore[arg-type]

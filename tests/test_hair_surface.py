@@ -34,9 +34,8 @@ from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.part import prepare_whole_head
 from mien.training.whole_head.unseen import Unseen
 from plain_settings import plain_run
-from sh_colors import rgb_from_sh
 from test_training_resume import RESULTS
-from toy_scene import surface_of, toy_sequence
+from toy_scene import rgb_from_sh, surface_of, toy_sequence
 from train_toy import stopped_at
 
 _HAIR, _RATE = 0.02, 1e-3
@@ -136,13 +135,10 @@ def test_a_filled_run_resumes_to_the_same_bytes(tmp_path: Path) -> None:
         return [(tmp_path / name / file).read_bytes() for file in RESULTS]
 
     whole = run("whole")
-    with pytest.raises(KeyboardInterrupt):
-        run("halves", stopped_at(10))
+    pytest.raises(KeyboardInterrupt, run, "halves", stopped_at(10))
     assert run("halves") == whole
     assert run("still", hair_rate=0.0)[0] != whole[0]
 
-
-# -- hidden Gaussians ------------------------------------------------------------------------------------------------
 
 _COLOR = 0.3
 
@@ -185,7 +181,7 @@ def test_contributions_are_the_shares_of_the_picture(anny):
     assert (both >= found).all()
 
 
-def test_of_hidden_copies_one_stays(anny):
+def test_of_hidden_copies_one_stays_and_none_below_what_is_shown(anny):
     """A third Gaussian on each hidden triangle, and a second one on triangles that are shown."""
     avatar, view, back = _closed_avatar(anny)
     back &= contributions(avatar, [view]) < 0.03
@@ -197,9 +193,6 @@ def test_of_hidden_copies_one_stays(anny):
     left = avatar.store["face_index"][~removed].bincount(minlength=len(anny.faces))
     assert (left == 1).all(), "no triangle is left without a Gaussian, and none has two"
     assert len(rows) > 50
-
-
-def test_hidden_copies_below_what_is_shown_go(anny):
     avatar, view, _ = _closed_avatar(anny)
     rows, n = (anny.region_mask("nose") & (contributions(avatar, [view]) > 0.2)).nonzero()[:, 0], len(avatar.store)
     assert len(rows) > 20
@@ -283,7 +276,7 @@ def test_mirror_images_lie_on_the_other_side_in_the_same_region(anny, flame):
     assert (mirror_triangles(half) == -1).all()
 
 
-def test_an_unseen_side_gets_the_mirror_images_colors(anny):
+def test_an_unseen_side_gets_the_mirror_images_colors_without_a_border(anny):
     """A mole on one cheek appears on the other, which the camera did not see."""
     colors, middles, face = _painted(anny), _middles(anny), head_parts(anny).face
     away = (middles - torch.tensor([0.045, -0.03, 0.08])).norm(dim=1)
@@ -292,10 +285,7 @@ def test_an_unseen_side_gets_the_mirror_images_colors(anny):
     colors[mole] = torch.tensor([0.4, 0.25, 0.2])
     completed = _completed(anny, middles[:, 0] > -0.01, colors)
     assert (completed[mirror_triangles(anny)[mole]] - colors[mole]).abs().max() < 0.02
-
-
-def test_no_border_shows_if_one_side_is_lit_less(anny):
-    """The left is brighter than the right. Where neither side is on the midline, the step between both is small."""
+    # The left is brighter than the right. Where neither side is on the midline, the step between both is small.
     middles = _middles(anny)
     lit = _SKIN * (1 + 3 * middles[:, :1].clamp(-0.07, 0.07))
     completed = _completed(anny, middles[:, 0] > -0.03, lit)

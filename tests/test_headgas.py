@@ -155,7 +155,7 @@ def test_the_papers_schedule() -> None:
     assert config.photometric == Photometric(0.8, 0.2, perceptual=perceptual)
 
 
-def test_points_are_on_the_mesh_evenly_by_area() -> None:
+def test_points_are_on_the_mesh_evenly_by_area_and_know_their_neighbors() -> None:
     # A large triangle in z = 0 and one with a ninth of its area in z = 1.
     vertices = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]])
     torch.manual_seed(0)
@@ -165,9 +165,6 @@ def test_points_are_on_the_mesh_evenly_by_area() -> None:
     assert (points[:, :2] >= 0).all()
     assert (points[large, :2].sum(-1) <= 3.0001).all()
     torch.testing.assert_close(points[large, :2].mean(0), torch.ones(2), atol=0.05, rtol=0)
-
-
-def test_distances_of_neighbors_and_expressions_and_the_encoding_of_places() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [10, 0, 0]])
     expected = torch.tensor([2.0, (9 + 10 + 104**0.5) / 3])
     torch.testing.assert_close(neighbor_distances(points)[[0, 4]], expected)

@@ -1,7 +1,5 @@
 """A stranger's workspace leads nowhere else, and is refused if its files do not fit together.
-
-mien follows no link and no name out of it. Single values are in `fuzzing.values`.
-"""
+mien follows no link and no name out of it. Single values are in `fuzzing.values`."""
 
 import json
 import os
@@ -23,7 +21,6 @@ from mien.cli import main
 from mien.disk.files import file_digest, read_tensors, write_tensors
 from mien.disk.inside import check_tree, inside, is_plain_name, remove_tree
 from mien.disk.workspace import Workspace, check_new_workspace, open_workspace
-from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation.experiment import Frame
 from mien.evaluation.partial import PartialScores
@@ -34,6 +31,7 @@ from mien.tracking.scoring_files import read_scoring
 from mien.tracking.settings import TrackingSettings
 from mien.training import read_sequence, trainer
 from mien.training.run import read_run_config
+from refusals import refuses
 from shared_things import MadeOnce, evaluated_workspace
 from toy_scene import toy_face_model, toy_sequence
 
@@ -81,9 +79,7 @@ def put(link: Path, target: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["sequences/clip/capture/cache", "runs/toy/avatar/avatar.safetensors", "a pipe"])
-def test_no_command_follows_a_link(
-    place: str, workspace: Path, victim: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_follows_a_link(place: str, workspace: Path, victim: Path, tmp_path: Path, capsys) -> None:
     """Nor waits for a pipe."""
     out, told, began = tmp_path / "out", f"{workspace / place}: is a link", time.monotonic()
     if place == "a pipe":
@@ -91,8 +87,7 @@ def test_no_command_follows_a_link(
         config.unlink()
         os.mkfifo(config)
         told = f"{config}: is not an ordinary file"
-        with pytest.raises(UserError, match="not an ordinary file"):
-            read_run_config(config.parent)
+        refuses("not an ordinary file", read_run_config, config.parent)
     else:
         put(workspace / place, victim / "notes" if "." in place else victim)
     (out / "avatar").mkdir(parents=True)
@@ -113,9 +108,8 @@ def test_links_are_found_wherever_they_are(made_once: MadeOnce, tmp_path: Path, 
         received = shutil.copytree(evaluated_workspace(made_once), tmp_path / str(number), copy_function=os.link)
         put(received / place, victim / "notes" if place in FILES else victim)
         for door in (open_workspace, check_new_workspace):
-            with pytest.raises(UserError, match="a link") as error:
-                door(received)
-            assert str(received / place) in str(error.value)
+            error = refuses("a link", door, received)
+            assert str(received / place) in error
 
 
 def test_an_analysis_goes_to_no_link(workspace: Path, victim: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,8 +135,7 @@ def test_the_library_follows_no_link_either(workspace: Path, victim: Path, tmp_p
         if place.exists():
             place.rename(aside)
         put(place, victim)
-        with pytest.raises(UserError, match="a link"):
-            read()
+        refuses("a link", read)
         place.unlink()
         if aside.exists():
             aside.rename(place)
@@ -168,8 +161,7 @@ def test_nothing_is_written_through_links_nor_second_names(workspace: Path, tmp_
         for make in (os.symlink, os.link):
             path.unlink(missing_ok=True)
             make(victim / "frames.u8", path)
-            with pytest.raises(UserError, match="is a link|has another name elsewhere"):
-                write()
+            refuses("is a link|has another name elsewhere", write)
     assert partial.read() == {}
     layout = FrameLayout(tmp_path / "capture", ("0",), 2, 4, 4)
     (layout.folder / "frames/0").mkdir(parents=True)
@@ -195,11 +187,9 @@ def test_names_that_lead_elsewhere(tmp_path: Path) -> None:
     for name in names:
         assert not is_plain_name(name)
         for find in (lambda name: inside(tmp_path, name), Workspace(tmp_path).run_dir)[: 1 + isinstance(name, str)]:
-            with pytest.raises(UserError, match="give a plain name"):
-                find(name)
+            refuses("give a plain name", find, name)
     for name in ("../x", "/etc/x", "a\0b", ""):
-        with pytest.raises(UserError, match="cannot be the name of a face model"):
-            read_landmarks(name, toy_face_model())
+        refuses("cannot be the name of a face model", read_landmarks, name, toy_face_model())
     for name in ("clip", "Anna 2", "a:b", "12\u202fAM", "ü", "声", ".hidden"):
         assert inside(tmp_path, name) == tmp_path / name
 
@@ -213,11 +203,7 @@ def test_a_deep_tree_is_told(tmp_path: Path) -> None:
         os.close(place)
         place = below
     os.close(place)
-    with pytest.raises(UserError, match="cannot be searched"):
-        check_tree(tmp_path)
-
-
-# What does not fit together -------------------------------------------------------------------------------------------
+    refuses("cannot be searched", check_tree, tmp_path)
 
 
 def test_partial_figures_of_other_kinds_are_dropped(workspace: Path) -> None:
@@ -246,8 +232,7 @@ def test_a_picture_larger_than_it_should_be_is_not_decoded(workspace: Path, monk
     ):
         data = file.read_bytes()
         file.write_bytes(data[:16] + (30000).to_bytes(4, "big") * 2 + data[24:])
-        with pytest.raises(UserError, match="damaged, or not of 32x32 pixels"):
-            read()
+        refuses("damaged, or not of 32x32 pixels", read)
     assert decoded == []
     assert not (folder / "capture/cache/frames.u8").exists()
 
@@ -261,13 +246,10 @@ def test_parts_of_a_sequence_have_to_be_of_the_same_pictures(workspace: Path) ->
     write_tensors(path, tensors)
     edit_json(path.with_suffix(".json"), lambda content: content.update(tensors_sha256=file_digest(path)))
     read_tracking(clip / "tracking")
-    with pytest.raises(UserError, match="other pictures than the capture"):
-        read_sequence(clip)
+    refuses("other pictures than the capture", read_sequence, clip)
 
 
-def test_kept_pieces_of_a_tracking_that_are_of_no_use(
-    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_kept_pieces_of_a_tracking_that_are_of_no_use(workspace: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     """Tracking starts again, once, if the kept files are whole but hold something else."""
     keep, seen = tmp_path / ".tracking-0123", []
     keep.mkdir()
@@ -285,12 +267,10 @@ def test_kept_pieces_of_a_tracking_that_are_of_no_use(
     assert seen == [True, False]
     assert "starts again" in capsys.readouterr().err
     monkeypatch.setattr(pipeline, "track_once", lambda *_: {}["a bug of ours"])
-    with pytest.raises(KeyError):
-        track_subject(*arguments)
+    pytest.raises(KeyError, track_subject, *arguments)
 
 
 def test_a_tracking_with_the_hash_of_another_model_names_its_folder(tmp_path: Path) -> None:
     model, sequence = toy_sequence(timesteps=2, size=32)
     foreign = replace(sequence, folder=tmp_path, tracking=replace(sequence.tracking, face_model_hash="f" * 16))
-    with pytest.raises(UserError, match=f"^{tmp_path}: was tracked with another version of face model"):
-        trainer.check_trackings([foreign], model)
+    refuses(f"^{tmp_path}: was tracked with another version of face model", trainer.check_trackings, [foreign], model)

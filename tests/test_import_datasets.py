@@ -1,32 +1,40 @@
 """`mien import` on the command line: what is told before, the workspace, its split, and mistakes.
-
-An exported GaussianAvatars folder is imported, posed at any frame, rendered, and exported again.
-"""
+An exported GaussianAvatars folder is imported, posed at any frame, rendered, and exported again."""
 
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+import color_charts
 from dataset_scene import NoDetector, Scene, drawn_person, unfound
-from dataset_writers import write_imavatar, write_insta
+from dataset_writers import FRONTAL, write_imavatar, write_insta, write_nersemble, write_picture
+from known import known
 from mien.avatar import load_avatar
+from mien.camera import Camera
+from mien.capture import read_capture
+from mien.capture.capture import Capture
 from mien.cli import main
 from mien.datasets import overlay, sequences
 from mien.disk.files import write_json
 from mien.face.loading import add_face_model
+from mien.lab.synthetic import RECIPES
+from mien.lab.synthetic.recipe import Segment
+from mien.lab.synthetic.scene import SyntheticScene
 from mien.media.source import read_image
+from mien.media.video import write_video
 from mien.pipeline import import_dataset as importing
 from mien.runtime import load as load_portable
 from mien.training import TrainSettings, read_sequence
 from mien.training.footage.frames import training_frames
-from mien.training.run import read_face_track
+from mien.training.run import read_curves, read_face_track
 from mien.training.splits.own import OwnSplit, read_own_split, with_own_split, write_own_split
-from shared_things import MadeOnce, toy_workspace
-from toy_workspace import write_toy_workspace
+from refusals import complaint
+from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 
 CLIPS = ("MVI_1810", "MVI_1812")
 
@@ -45,14 +53,6 @@ def added(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
-
-
-def refused(line: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main(line) == 2
-    told = [one for one in capsys.readouterr().err.splitlines() if one.startswith("mien: ")]
-    assert len(told) == 1
-    assert message in told[0]
 
 
 def test_a_dry_run_only_tells(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,8 +77,8 @@ def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest
     settings = with_own_split(TrainSettings(split="dataset"), splits, dict.fromkeys(CLIPS, 3))
     assert settings.held_out_sequences == (CLIPS[1],)
     assert {frame.sequence for frame in training_frames(read, settings)} == {0}
-    refused(["train", str(out), "--split", "dataset", "--hold-out", CLIPS[0]], "decides what is held out", capsys)
-    refused(again, "is there already", capsys)
+    assert "decides what is held out" in complaint(capsys, "train", out, "--split", "dataset", "--hold-out", CLIPS[0])
+    assert "is there already" in complaint(capsys, *again)
     assert main([*again, "--resume"]) == 0
     assert "all sequences are there already" in capsys.readouterr().err
 
@@ -101,16 +101,16 @@ def test_pictures_are_tracked_again_if_asked(subject: Path, tmp_path: Path, monk
 @pytest.mark.usefixtures("added")
 def test_mistakes_leave_nothing(scene: Scene, subject: Path, tmp_path: Path, capsys) -> None:
     out = ["--out", str(tmp_path / "out")]
-    refused(["import", str(subject), *out], "needs FLAME 2020", capsys)
-    refused(["import", str(subject), *out, "--retrack", "--face-model", "flame"], "give only one", capsys)
-    refused(["import", str(subject.parent), *out], "holds 1 people (subject1); import each", capsys)
+    assert "needs FLAME 2020" in complaint(capsys, "import", str(subject), *out)
+    assert "give only one" in complaint(capsys, "import", str(subject), *out, "--retrack", "--face-model", "flame")
+    assert "holds 1 people (subject1); import each" in complaint(capsys, "import", str(subject.parent), *out)
     other = write_insta(tmp_path / "other", scene)
     frame = other / "checkpoint/00001.frame"
     frame.unlink()
     frame.symlink_to("/etc/hostname")
-    refused(["import", str(other), *out, "--face-model", "flame"], "leads out of the dataset", capsys)
+    assert "leads out of the dataset" in complaint(capsys, "import", str(other), *out, "--face-model", "flame")
     wrong = ["import", str(other), *out, "--dataset", "vhap"]
-    refused(wrong, f"{other}: looks like insta, and cannot be read as vhap; leave --dataset out (", capsys)
+    assert f"{other}: looks like insta, and cannot be read as vhap; leave --dataset out (" in complaint(capsys, *wrong)
     # Damaged JSON is named.
     place = shutil.copytree(subject, tmp_path / "subject1")
     file = place / "subject1/MVI_1810/flame_params.json"
@@ -128,7 +128,7 @@ def test_mistakes_leave_nothing(scene: Scene, subject: Path, tmp_path: Path, cap
         if value is None:
             del content["frames"][1][name]
         file.write_text(json.dumps(content))
-        refused(["import", str(place), *out, "--face-model", "flame"], words, capsys)
+        assert words in complaint(capsys, "import", str(place), *out, "--face-model", "flame")
     assert not list((tmp_path / "out").glob("sequences/*"))
 
 
@@ -138,14 +138,14 @@ def test_the_protocol_of_a_dataset_scores_its_mattes_and_its_frames(made_once: M
     root = Path(shutil.copytree(toy_workspace(made_once), tmp_path / "W"))
     clip, file = root / "sequences/clip", root / "runs/toy/config.json"
     line = ["evaluate", str(root), "--protocol", "insta", "--no-perceptual"]
-    refused(line, "was not imported; leave --protocol insta out", capsys)
+    assert "was not imported; leave --protocol insta out" in complaint(capsys, *line)
     write_own_split(clip, OwnSplit(((1, 3),)), {"imported": {"dataset": "insta", "from": "there"}})
-    refused(line, "was trained with --split", capsys)
+    assert "was trained with --split" in complaint(capsys, *line)
     config = json.loads(file.read_text())
     config["settings"]["split"] = "dataset"
     content = {name: value for name, value in config.items() if name not in ("format", "version", "checksum")}
     write_json(file, config["format"], config["version"], content)
-    refused([*line[:3], "imavatar", line[4]], "was imported from insta", capsys)
+    assert "was imported from insta" in complaint(capsys, *line[:3], "imavatar", line[4])
     assert main(line) == 0
     (entry,) = json.loads((root / "runs/toy/metrics.json").read_text())["protocols"].values()
     assert entry["per_frame"]["timestep"] == [1, 2]
@@ -219,6 +219,110 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
         (("evaluate", imported), ""),  # An imported run is not scored or continued.
         (("train", imported), ""),
     ):
-        refused([*line], message, capsys)
+        assert message in complaint(capsys, *line)
     assert not list(tmp_path.glob("N*/runs"))
     assert [path.name for path in tmp_path.iterdir() if path.suffix] == []
+
+
+PERSON = replace(
+    RECIPES["plain"], width=550, height=802, fps=25.0, turns=(25.0, 10.0), rotation=(14.0, 8.0, 4.0),
+    script=(Segment("speech", 0.32),), texture_size=512,
+)  # fmt: skip
+SERIALS = (FRONTAL, "222200036", "222200046")
+"""The cameras in the order of the drawn ring, whose first one is in front."""
+STRIDE = 3
+COLORS = {serial: color_charts.correction(seed) for seed, serial in enumerate(SERIALS)}
+"""The correction of each camera's colours."""
+FULL = 4
+"""NeRSemble's pictures have so many times the side of those that are drawn here."""
+LANDMARKS = ("--tracking.schedule", "landmarks", "--overlay", "none")
+SMALL = ("--preset", "draft", "--training.resolution", "128")
+PLAIN = ("--training.unseen", "trained", "--training.inside", "free", "--training.mesh", "tracked")
+"""Options that leave out what closes the sides that no camera filmed."""
+
+
+@pytest.fixture(scope="module")
+def rig() -> SyntheticScene:
+    turning = (Segment("turns", 0.6),)
+    return SyntheticScene(replace(PERSON, cameras="ring", ring_size=3, fps=5.0, script=turning), 3)
+
+
+def film(path: Path, pictures: list[np.ndarray], repeats: int = 1, fps: float = 73.0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_video(path, (picture for picture in pictures for _ in range(repeats)), fps, crf=4)
+
+
+def write_person(folder: Path, rig: SyntheticScene) -> list[np.ndarray]:
+    """Write a person of NeRSemble's raw recordings, with one timestep in three pictures. Return the frontal mattes.
+    The colours that the cameras film are others than those that were drawn, until they are corrected."""
+    drawn = [list(rig.timestep_frames(timestep)) for timestep in range(rig.timesteps)]
+    empty = (255 * known(rig.background)).astype(np.uint8)
+
+    def video(path: Path, serial: str) -> None:
+        own = (frames[SERIALS.index(serial)].image for frames in drawn)
+        film(path, [color_charts.filmed(picture, COLORS[serial]) for picture in own], STRIDE)
+
+    write_nersemble(folder, SERIALS, video, COLORS)
+    for serial, matrix in COLORS.items():
+        write_picture(folder / f"sequences/BACKGROUND/image_{serial}.jpg", color_charts.filmed(empty, matrix))
+    full, cameras = np.diag([FULL, FULL, 1.0]), dict(zip(SERIALS, rig.cameras, strict=True))
+    poses = {serial: camera.viewmat.double().tolist() for serial, camera in cameras.items()}
+    intrinsics = {serial: (full @ camera.K.double().numpy()).tolist() for serial, camera in cameras.items()}
+    content = {"world_2_cam": poses, "intrinsics": intrinsics}
+    (folder / "calibration/camera_params.json").write_text(json.dumps(content))
+    return [frames[SERIALS.index(FRONTAL)].matte for frames in drawn]
+
+
+@pytest.mark.unchecked
+def test_raw_recordings_of_nersemble_become_an_avatar(rig: SyntheticScene, tmp_path: Path) -> None:
+    person, root = tmp_path / "017", tmp_path / "me"
+    mattes = write_person(person, rig)
+    assert main(["import", str(person), "--out", str(root)]) == 0
+    assert main(["track", str(root), *LANDMARKS]) == 0
+    folder = root / "sequences/EMO-1-shout+laugh"
+    capture, tracking = read_capture(folder / "capture"), read_sequence(folder).tracking
+    assert (capture.timesteps, capture.camera_ids) == (rig.timesteps, tuple(sorted(SERIALS)))
+    check_cameras(rig, capture, tracking.cameras, mattes)
+    check_colors(rig, capture)
+    # The head is where it was drawn, in the dataset's world.
+    off = tracking.face.head_translation - rig.tracking().face.head_translation
+    assert float(off.norm(dim=1).median()) < 0.02
+    assert (
+        main(["train", str(root), "--run", "a", "--steps", "20", *SMALL, *PLAIN, "--training.record-every", "2"]) == 0
+    )
+    psnr = read_curves(root / "runs/a")["psnr"]
+    assert psnr[-3:].mean() > psnr[:3].mean() + 1
+
+
+def cropped(capture: Capture, serial: str, drawn: np.ndarray) -> np.ndarray:
+    """Return the part of a drawn picture that a camera's captured pictures show."""
+    crop = capture.source["cameras"][serial]["crop"]
+    step = crop["width"] / capture.width
+    to_drawn = np.array([[step, 0, crop["left"] + step / 2 - 0.5], [0, step, crop["top"] + step / 2 - 0.5]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(drawn, to_drawn, (capture.width, capture.height), flags=flags)
+
+
+def check_colors(rig: SyntheticScene, capture: Capture) -> None:
+    """Captured pictures have the drawn colours. tests/test_capture_lens.py has the terms in any order."""
+    frames = list(rig.timestep_frames(0))
+    for index, serial in enumerate(capture.camera_ids):
+        drawn = cropped(capture, serial, frames[SERIALS.index(serial)].image)
+        off = np.abs(capture.images[0, index].astype(float) - drawn).mean((0, 1))
+        assert off.max() < 1, (serial, off)  # the video is lossy
+
+
+def check_cameras(rig: SyntheticScene, capture, cameras: tuple[Camera, ...], mattes: list[np.ndarray]) -> None:
+    """Check that cameras are the drawn ones, up to the crop, and that mattes are the person's."""
+    places = {serial: index for index, serial in enumerate(capture.camera_ids)}
+    for serial, drawn in zip(SERIALS, rig.cameras, strict=True):
+        assert float((cameras[places[serial]].viewmat - drawn.viewmat).abs().max()) < 1e-5
+    crop = capture.source["cameras"][FRONTAL]["crop"]
+    step = crop["width"] / capture.width
+    K, front = cameras[places[FRONTAL]].K.double().numpy(), rig.cameras[0].K.double().numpy()
+    moved = np.array([[1, 0, crop["left"]], [0, 1, crop["top"]], [0, 0, 1]]) @ np.diag([step, step, 1.0]) @ K
+    assert np.abs(moved - front).max() < 0.01
+    for matte, found in zip(mattes, capture.mattes[:, places[FRONTAL]], strict=True):
+        expected = cropped(capture, FRONTAL, matte)
+        both, either = ((found > 127) & (expected > 127)).sum(), ((found > 127) | (expected > 127)).sum()
+        assert both > 0.85 * either  # the network's mattes fade at the shirt

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from capture_helpers import assert_same_capture, random_capture
+from known import known
 from mien.capture import read_capture, write_capture
 from mien.disk import locks
 from mien.disk.files import replace_folder
@@ -48,7 +49,7 @@ def test_one_holds_and_the_other_is_told(other: Holder, tmp_path: Path) -> None:
         assert holder_of(place) is None, "several places are held all or none"
 
 
-def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
+def test_nothing_stays_of_a_lock_and_a_removed_file_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
     with hold(tmp_path / "new" / "deep" / "r"):
         assert (tmp_path / "new" / "deep" / ".r.lock").is_file()
     assert list(tmp_path.iterdir()) == []
@@ -61,6 +62,25 @@ def test_nothing_stays_of_a_lock(tmp_path: Path) -> None:
     one, other = (tmp_path / ("n" * 250 + end) for end in "12")
     with hold(one), hold(other):
         assert lock_file(one) != lock_file(other), "long names have locks of their own"
+    # Threads that lock in turns never hold it together.
+    inside, most = [0], [0]
+
+    def visit(_: int) -> None:
+        visits = 0
+        while visits < 60:
+            try:
+                with hold(tmp_path / "r"):
+                    inside[0] += 1
+                    most[0] = max(most[0], inside[0])
+                    visits += 1
+                    time.sleep(0)
+                    inside[0] -= 1
+            except BeingWrittenError:
+                time.sleep(0.001)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(visit, range(4)))
+    assert (most[0], list(tmp_path.iterdir())) == (1, [tmp_path / "new"])
 
 
 def test_children_do_not_keep_the_lock_of_a_parent_that_has_died(tmp_path: Path) -> None:
@@ -86,8 +106,7 @@ with hold(place):
     words = [sys.executable, "-c", script, str(tmp_path / "r")]
     process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     with process:
-        assert process.stdout is not None
-        children = [int(word) for word in process.stdout.readline().split()]
+        children = [int(word) for word in known(process.stdout).readline().split()]
         try:
             assert len(children) == 2
             with pytest.raises(BeingWrittenError), hold(tmp_path / "r"):
@@ -106,11 +125,9 @@ with hold(place):
 STRANGERS: dict[str, Callable[[Path, Path], object]] = {
     "link": lambda file, mine: file.symlink_to(mine),
     "link to nowhere": lambda file, mine: file.symlink_to(mine.with_name("nowhere")),
-    "pipe": lambda file, mine: os.mkfifo(file),
-    "second name": lambda file, mine: file.hardlink_to(mine),
-    "other content": lambda file, mine: file.write_text("mine"),
-    "folder": lambda file, mine: file.mkdir(),
-}
+    "pipe": lambda file, mine: os.mkfifo(file), "second name": lambda file, mine: file.hardlink_to(mine),
+    "other content": lambda file, mine: file.write_text("mine"), "folder": lambda file, mine: file.mkdir(),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", STRANGERS)
@@ -180,29 +197,6 @@ def test_a_place_that_cannot_be_written(number: int, tmp_path: Path, monkeypatch
     if number == errno.EACCES:
         with hold(tmp_path / "theirs"), pytest.raises(BeingWrittenError), hold(tmp_path / "theirs"):
             pass
-
-
-def test_a_lock_whose_file_was_removed_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
-    """Threads that lock in turns never hold it together."""
-    inside, most = [0], [0]
-
-    def visit(_: int) -> None:
-        visits = 0
-        while visits < 60:
-            try:
-                with hold(tmp_path / "r"):
-                    inside[0] += 1
-                    most[0] = max(most[0], inside[0])
-                    visits += 1
-                    time.sleep(0)
-                    inside[0] -= 1
-            except BeingWrittenError:
-                time.sleep(0.001)
-
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(visit, range(4)))
-    assert most[0] == 1
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_reader_of_damage_asks_who_writes(other: Holder, tmp_path: Path) -> None:

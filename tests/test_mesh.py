@@ -51,25 +51,25 @@ def camera_at(position: list[float], fov_x: float, size: int) -> Camera:
 head_camera = partial(camera_at, [0.2, 0.1, 1.2], 0.9)
 
 
-def sphere(subdivisions: int) -> tuple[Tensor, Tensor]:
-    made = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return torch.tensor(np.array(made.vertices)).float(), torch.tensor(np.array(made.faces)).long()
-
-
-def test_known_triangle_lands_on_known_pixels():
+def test_a_known_triangle_lands_on_known_pixels_and_the_nearest_is_seen():
     vertices = at_depth([(2, 1, 1), (6, 1, 1), (2, 5, 1)])
     fragments = rasterize_mesh(vertices, torch.tensor([[0, 1, 2]]), pixel_camera())
     rows, columns = (fragments.face_index >= 0).nonzero().unbind(1)
     # Centres on the slanted edge x + y = 7 belong to the triangle on its other side: it is no top or left edge.
     expected = {(row, column) for row in range(1, 5) for column in range(2, 6) if row + column + 1 < 7}
     assert set(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
-    assert fragments.depth[1, 2] == 1
-    assert fragments.depth[0, 0] == torch.inf
+    assert (fragments.depth[1, 2], fragments.depth[0, 0]) == (1, torch.inf)
     assert fragments.barycentric[0, 0].sum() == 0
     torch.testing.assert_close(fragments.barycentric[1, 2], torch.tensor([0.75, 0.125, 0.125]))
     for order, seen in (([0, 1, 2], False), ([0, 2, 1], True)):  # clockwise, counter-clockwise
         culled = rasterize_mesh(vertices, torch.tensor([order]), pixel_camera(), cull_backfaces=True)
         assert bool((culled.face_index == 0).any()) == seen
+    near, far = [(1, 1, 1), (9, 1, 1), (1, 9, 1)], [(0, 0, 2), (15, 0, 2), (0, 11, 2)]
+    vertices = at_depth(near + far)
+    for faces, expected in (([[0, 1, 2], [3, 4, 5]], 0), ([[3, 4, 5], [0, 1, 2]], 1)):
+        fragments = rasterize_mesh(vertices, torch.tensor(faces), pixel_camera())
+        assert (fragments.face_index[3, 3], fragments.depth[3, 3]) == (expected, 1)
+        assert fragments.face_index[0, 5] == 1 - expected
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -91,7 +91,7 @@ def test_every_pixel_of_a_tessellated_quad_is_covered_exactly_once(seed: int):
     assert (hits == 1).all()
 
 
-def test_interpolation_is_perspective_correct():
+def test_interpolation_is_perspective_correct_and_that_of_its_reference():
     vertices, faces = random_mesh()
     camera = head_camera(96)
     fragments = rasterize_mesh(vertices, faces, camera)
@@ -112,16 +112,17 @@ def test_interpolation_is_perspective_correct():
     torch.testing.assert_close(fragments.barycentric[covered][inside].double(), expected[inside], atol=1e-5, rtol=1e-5)
     projected, _ = camera.project(interpolate(fragments, vertices, faces)[covered][inside])
     torch.testing.assert_close(projected.double(), pixels[inside, :2], atol=1e-2, rtol=0)
-
-
-def test_the_nearest_triangle_is_seen_whatever_the_order():
-    near, far = [(1, 1, 1), (9, 1, 1), (1, 9, 1)], [(0, 0, 2), (15, 0, 2), (0, 11, 2)]
-    vertices = at_depth(near + far)
-    for faces, expected in (([[0, 1, 2], [3, 4, 5]], 0), ([[3, 4, 5], [0, 1, 2]], 1)):
-        fragments = rasterize_mesh(vertices, torch.tensor(faces), pixel_camera())
-        assert fragments.face_index[3, 3] == expected
-        assert fragments.depth[3, 3] == 1
-        assert fragments.face_index[0, 5] == 1 - expected
+    vertices, faces = random_mesh()
+    fragments = rasterize_mesh(vertices, faces, head_camera(96))
+    for attributes, corners in ((torch.randn(40, 5), faces), (torch.randn(60, 3, 4), torch.arange(180).view(60, 3))):
+        own = attributes.requires_grad_()
+        rows = own.detach().flatten(0, -2).double().requires_grad_()
+        found, expected = interpolate(fragments, own, faces), interpolate_reference(fragments, rows, corners)
+        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
+        weights = torch.randn(expected.shape)
+        (grad,) = torch.autograd.grad(found, own, weights)
+        (exact,) = torch.autograd.grad(expected, rows, weights.double())
+        torch.testing.assert_close(grad.double().view(exact.shape), exact, atol=1e-4, rtol=1e-5)
 
 
 def test_a_triangle_through_the_near_plane_is_cut_there():
@@ -159,20 +160,6 @@ def test_bad_input_is_dropped_or_refused():
         rasterize_mesh(vertices, torch.tensor([[0, 1, 7]]), pixel_camera())
 
 
-def test_native_interpolation_equals_the_reference():
-    vertices, faces = random_mesh()
-    fragments = rasterize_mesh(vertices, faces, head_camera(96))
-    for attributes, corners in ((torch.randn(40, 5), faces), (torch.randn(60, 3, 4), torch.arange(180).view(60, 3))):
-        own = attributes.requires_grad_()
-        rows = own.detach().flatten(0, -2).double().requires_grad_()
-        found, expected = interpolate(fragments, own, faces), interpolate_reference(fragments, rows, corners)
-        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
-        weights = torch.randn(expected.shape)
-        (grad,) = torch.autograd.grad(found, own, weights)
-        (exact,) = torch.autograd.grad(expected, rows, weights.double())
-        torch.testing.assert_close(grad.double().view(exact.shape), exact, atol=1e-4, rtol=1e-5)
-
-
 def test_texture_lookup():
     texture = torch.arange(12.0).view(3, 4, 1)
     uv = torch.tensor([[[0.125, 1 - 1 / 6], [0.875, 1 / 6]], [[0.25, 0.5], [-1.0, 2.0]]])
@@ -196,7 +183,8 @@ def test_harmonics_are_orthonormal_and_light_is_linear():
 
 
 def test_picture_of_a_sphere():
-    vertices, faces = sphere(4)
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    vertices, faces = torch.tensor(np.array(sphere.vertices)).float(), torch.tensor(np.array(sphere.faces)).long()
     camera = camera_at([0.0, 0.0, 4.0], 0.8, 64)
     radius = float(camera.K[0, 0]) / (4**2 - 1) ** 0.5
     image, alpha = render_mesh(vertices, faces, camera, background=(0.0, 0.0, 1.0), supersample=4)

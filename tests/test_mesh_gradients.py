@@ -63,12 +63,10 @@ def loss_weights(shape: tuple[int, ...]) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
 
-def finite_difference(
-    function: Callable[[Tensor], Tensor], at: Tensor, step: float, entries: int = 24
-) -> tuple[Tensor, Tensor]:
+def finite_difference(function: Callable[[Tensor], Tensor], at: Tensor, step: float) -> tuple[Tensor, Tensor]:
     """Return some entries of a function's gradient and their derivatives by central differences."""
     flat = at.double().flatten()
-    chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(9))[:entries]
+    chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(9))[:24]
     out = []
     for index in chosen:
         shift = torch.zeros_like(flat)

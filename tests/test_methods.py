@@ -23,7 +23,6 @@ from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import GradientSettings, MethodConfig, PerceptualLoss, Photometric
 from mien.avatar.store import GaussianStore, Moments
-from mien.errors import UserError
 from mien.face import FaceModel
 from mien.formats.glb import MeshModel, read_glb_avatar, write_glb
 from mien.formats.page import write_page
@@ -35,6 +34,7 @@ from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from plain_settings import plain_config, plain_gaussian_avatars, plain_mono_gaussian_avatar, plain_run
+from refusals import refuses
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 
 SIZE = 32
@@ -203,8 +203,7 @@ def plain_avatar(method: str = DEFAULT_METHOD, face_model: FaceModel | None = No
 
 
 def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no trained avatar \\(no avatar.json\\)"):
-        load_avatar(tmp_path)
+    refuses("holds no trained avatar \\(no avatar.json\\)", load_avatar, tmp_path)
     write_avatar(tmp_path, plain_avatar())
     description, tensors = tmp_path / "avatar.json", tmp_path / "avatar.safetensors"
     edit_json(description, lambda content: None)
@@ -216,27 +215,21 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path: Path) -> None:
         (toy_face_model().content_hash, "0" * 16, "was trained with face model 'toy'"),
     ):
         description.write_text(content.replace(old, new))
-        with pytest.raises(UserError, match=words):
-            load_avatar(tmp_path)
+        refuses(words, load_avatar, tmp_path)
     for damage, words in (
-        ({"kind": None}, "lacks \\['kind'\\]"),
-        ({"config": "default"}, "config"),
-        ({"gaussians": -1}, "-1 Gaussians"),
-        ({"gaussians": 10**12}, "does not fit its settings"),
-        ({"face_model": 7}, "face_model"),
+        ({"kind": None}, "lacks \\['kind'\\]"), ({"config": "default"}, "config"), ({"gaussians": -1}, "-1 Gaussians"),
+        ({"gaussians": 10**12}, "does not fit its settings"), ({"face_model": 7}, "face_model"),
         ({"surprise": 1}, "unknown entries \\['surprise'\\]"),
-    ):
+    ):  # fmt: skip
         damaged = {name: value for name, value in (json.loads(content) | damage).items() if value is not None}
         description.write_text(json.dumps(damaged))
-        with pytest.raises(UserError, match=words):
-            load_avatar(tmp_path)
+        refuses(words, load_avatar, tmp_path)
     description.write_text(content)
     middle = len(whole) // 2
     flipped = whole[:middle] + bytes([whole[middle] ^ 0xFF]) + whole[middle + 1 :]
     for damaged, words in ((whole[:500], "damaged"), (flipped, r"\.safetensors: .*differs from what was written")):
         tensors.write_bytes(damaged)
-        with pytest.raises(UserError, match=words):
-            load_avatar(tmp_path)
+        refuses(words, load_avatar, tmp_path)
 
 
 def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
@@ -249,8 +242,7 @@ def test_face_models_that_may_not_be_passed_on_are_not(tmp_path: Path) -> None:
     assert torch.equal(torch.rand(1), expected)
     write_avatar(tmp_path / "own", plain_avatar(face_model=replace(toy_face_model(), name="flame", shareable=False)))
     assert not list((tmp_path / "own").glob("face_model*"))
-    with pytest.raises(UserError, match="flame"):
-        load_avatar(tmp_path / "own")
+    refuses("flame", load_avatar, tmp_path / "own")
 
 
 def make_store(n: int = 6) -> GaussianStore:

@@ -1,5 +1,6 @@
-"""Metrics agree with values computed by hand, slow second implementations, and published figures; LPIPS as well."""
+"""Metrics agree with second implementations and published figures, LPIPS as well. Pictures of reports are right."""
 
+import base64
 import shutil
 from pathlib import Path
 
@@ -11,12 +12,13 @@ from torch import Tensor, nn
 
 from mien.cli import main
 from mien.disk.files import read_json
-from mien.errors import UserError
 from mien.evaluation import scoring
 from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
+from mien.media.pictures import error_heat, heat_colors, picture_grid, picture_uri, shrink, side_by_side, to_uint8
 from mien.media.source import read_image
 from mien.perceptual import distance, lpips, weights
 from mien.perceptual.distance import load_perceptual
+from refusals import complaint, refuses
 
 
 def test_psnr_and_l1() -> None:
@@ -81,8 +83,7 @@ def test_first_map_in_one_step_equals_two(size: tuple[int, int]) -> None:
 def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path) -> None:
     load_perceptual.cache_clear()
     monkeypatch.setattr(weights, "PACKAGE", "no_such_package_here")
-    with pytest.raises(UserError, match="pip install stlpips-pytorch"):
-        load_perceptual()
+    refuses("pip install stlpips-pytorch", load_perceptual)
     path = tmp_path / "alex.pth"
     monkeypatch.setattr(weights, "weights_path", lambda backbone: path)
     for content, words in (
@@ -92,15 +93,13 @@ def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path
             path.write_bytes(content)
         elif content is not None:
             torch.save(content, path)
-        with pytest.raises(UserError, match=words):
-            load_perceptual()
+        refuses(words, load_perceptual)
     load_perceptual.cache_clear()
 
 
 CHANNELS = {"lpips-alex": (64, 192, 384, 256, 256), "lpips-vgg": (64, 128, 256, 512, 512)}
 COMPARED = {"lpips-alex": (1, 4, 7, 9, 11), "lpips-vgg": (3, 8, 15, 22, 29)}
-"""The layers of torchvision's networks whose maps LPIPS compares. Of VGG16 they are relu1_2, relu2_2, relu3_3, relu4_3
-and relu5_3."""
+"""Layers of torchvision's networks whose maps LPIPS compares. Of VGG16: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3."""
 TRUNKS = {trunk.backbone: trunk for trunk in lpips.TRUNKS}
 
 
@@ -165,15 +164,11 @@ def test_it_is_the_published_formula(backbone: str, tmp_path: Path) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     files = _write(tmp_path, "lpips-alex")
-    with pytest.raises(UserError, match="is not the file that torchvision published; give alexnet"):
-        lpips.load_lpips(files[0])
-    with pytest.raises(UserError, match="no such file"):
-        lpips.load_lpips(tmp_path / "none.pth")
-    with pytest.raises(UserError, match=r"damaged weights .*lpips==0\.1\.4"):
-        lpips.build_lpips(lpips.TRUNKS[1], *files)
+    refuses("is not the file that torchvision published; give alexnet", lpips.load_lpips, files[0])
+    refuses("no such file", lpips.load_lpips, tmp_path / "none.pth")
+    refuses(r"damaged weights .*lpips==0\.1\.4", lpips.build_lpips, lpips.TRUNKS[1], *files)
     (tmp_path / "bad.pth").write_bytes(b"no weights")
-    with pytest.raises(UserError, match="damaged weights"):
-        lpips.build_lpips(lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
+    refuses("damaged weights", lpips.build_lpips, lpips.TRUNKS[0], tmp_path / "bad.pth", files[1])
 
 
 def test_the_command_shows_it_beside_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -194,5 +189,42 @@ def test_the_command_shows_it_beside_the_others(tmp_path: Path, monkeypatch: pyt
     scores = read_json(out, "mien.scores", 1)
     assert scores["lpips_backbone"] == "lpips-alex"
     assert scores["per_frame"]["lpips"][1] == 0 < scores["per_frame"]["lpips"][0]
-    assert main([*command, "--lpips-weights", str(tmp_path / "none")]) == 2
-    assert "--lpips-weights" in capsys.readouterr().err
+    assert "--lpips-weights" in complaint(capsys, *command, "--lpips-weights", str(tmp_path / "none"))
+
+
+def _flat(height: int, width: int, value: int) -> np.ndarray:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def test_levels_are_rounded_pictures_shrunk_and_errors_shown_up_to_a_limit() -> None:
+    image = torch.tensor([[[-0.5, 0.5, 1.5], [0.0, 1.0, 1 / 255]]])
+    assert to_uint8(image).tolist() == [[[0, 128, 255], [0, 255, 1]]]
+    assert shrink(_flat(100, 50, 3), 40).shape == (40, 20, 3)
+    assert shrink(_flat(10, 5, 3), 40).shape == (10, 5, 3), "nothing is enlarged"
+    target = torch.zeros(1, 4, 3)
+    image = torch.tensor([0.0, 0.1, 0.2, 0.9])[None, :, None].expand(1, 4, 3)
+    heat = error_heat(image, target, limit=0.2)
+    assert heat[0, 0].tolist() == heat_colors(np.zeros((1, 1), np.float32))[0, 0].tolist()
+    assert heat[0, 2].tolist() == heat[0, 3].tolist() == heat_colors(np.ones((1, 1), np.float32))[0, 0].tolist()
+    brightness = heat.astype(int).sum(-1)[0]
+    assert brightness[0] < brightness[1] < brightness[2]
+
+
+def test_sheets_and_uris_hold_their_pictures() -> None:
+    joined = side_by_side([_flat(10, 8, 0), _flat(20, 30, 100)], gap=2)
+    assert joined.shape == (10, 8 + 2 + 15, 3)
+    assert (joined[:, :8] == 0).all()
+    assert (joined[:, 8:10] == 255).all()
+    assert (joined[:, 10:] == 100).all()
+    sheet = picture_grid([_flat(4, 6, value) for value in (10, 20, 30)], columns=2, gap=1)
+    assert (sheet.shape, sheet[0, 7, 0], sheet[5, 0, 0]) == ((9, 13, 3), 20, 30)
+    assert (sheet[5:, 7:] == 255).all()
+    picture = np.random.default_rng(0).integers(0, 255, (12, 9, 3)).astype(np.uint8)
+    for quality in (None, 95):
+        head, body = picture_uri(picture, quality).split(",")
+        assert head == f"data:image/{'png' if quality is None else 'jpeg'};base64"
+        decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body), np.uint8), cv2.IMREAD_COLOR_RGB)
+        assert decoded is not None
+        assert decoded.shape == picture.shape
+        if quality is None:
+            assert (decoded == picture).all()

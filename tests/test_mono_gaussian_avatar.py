@@ -24,8 +24,7 @@ from mien.face.posing import head_poses
 from mien.training import PRESETS
 from mono_avatars import SMALL, new_avatar, pictured
 from plain_settings import plain_mono_gaussian_avatar
-from sh_colors import rgb_from_sh
-from toy_scene import toy_face, toy_face_model
+from toy_scene import rgb_from_sh, toy_face, toy_face_model
 
 
 def with_pose_correctives() -> FaceModel:
@@ -282,9 +281,6 @@ def test_a_run_may_begin_at_a_later_epoch() -> None:
             assert getattr(late, part)(fraction) == getattr(whole, part)(0.6 + 0.4 * fraction)
     with pytest.raises(UserError, match="--method.epochs 60: give more than --method.first-epoch 60"):
         plain_mono_gaussian_avatar(epochs=60, first_epoch=60).check()
-
-
-# -- networks --------------------------------------------------------------------------------------------------------
 
 
 def softplus(values: Tensor) -> Tensor:

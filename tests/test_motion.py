@@ -22,6 +22,7 @@ from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.named import LOOK_ANGLE
 from recordings import COLUMNS, LAYOUTS, STILL, Frames, row, write_csv, write_json
+from refusals import refuses
 from small_face_model import make_small_face_model
 from toy_scene import toy_face_model
 
@@ -34,14 +35,13 @@ def read_rows(folder: Path, *rows: list[str], fps: float | None = None) -> Motio
     return read_live_link_face(write_csv(folder / "a.csv", *rows), fps)
 
 
-def test_values_times_and_turns(tmp_path: Path) -> None:
+def test_values_times_and_turns_and_the_lowest_rate_that_has_the_frame_numbers(tmp_path: Path) -> None:
     """Head angles follow Unreal: yaw to the subject's right, pitch down, roll to the left shoulder."""
     assert (len(COLUMNS), COLUMNS[2], COLUMNS[53:55]) == (63, "EyeBlinkLeft", ["TongueOut", "HeadYaw"])
     first = row("11:59:59:58.5", JawOpen=0.25, HeadYaw=0.3, EyeLookOutLeft=1, EyeLookInRight=1, EyeLookDownLeft=0.5)
     rows = row("11:59:59:59.5", JawOpen=0.5), row("12:00:00:00.5", JawOpen=1, HeadPitch=-0.2)
     motion = read_rows(tmp_path, first, *rows)
-    assert motion.fps == pytest.approx(60)
-    assert jaw(motion) == [0.25, 0.5, 1]
+    assert (motion.fps, jaw(motion)) == (pytest.approx(60), [0.25, 0.5, 1])
     np.testing.assert_allclose(motion.head_rotation[[0, 2]], [[0, -0.3, 0], [-0.2, 0, 0]], atol=1e-6)
     # Both eyes to the subject's left, the left one down as well.
     np.testing.assert_allclose(motion.eyes[0], [[LOOK_ANGLE / 2, LOOK_ANGLE, 0], [0, LOOK_ANGLE, 0]], atol=1e-6)
@@ -53,10 +53,7 @@ def test_values_times_and_turns(tmp_path: Path) -> None:
     ahead_and_left = [turned[0, 2], turned[1, 2], turned[1, 0]]
     expected = [math.sin(0.3) * math.cos(0.2), math.sin(0.2), math.sin(0.1) * math.cos(0.2)]
     assert ahead_and_left == pytest.approx([-value for value in expected], abs=1e-6)
-
-
-def test_the_rate_is_the_lowest_that_has_the_frame_numbers(tmp_path: Path) -> None:
-    """Frames of 30 a second have the numbers 0 to 29, so the number 30 means 48, the next rate."""
+    # Frames of 30 a second have the numbers 0 to 29, so the number 30 means 48, the next rate.
     for largest, rate in ((29, 30), (30, 48)):
         rows = [row(f"0:00:0{second}:{frame:02d}.0") for second in (0, 1) for frame in range(largest + 1)]
         motion = read_rows(tmp_path, *rows)
@@ -89,13 +86,11 @@ def test_bad_csv_files(tmp_path: Path) -> None:
         ([[*good[:1], "0"]], COLUMNS, "no row has a face"),
         ([], COLUMNS, "has no frames"),
     ):
-        with pytest.raises(UserError, match=part):
-            read_live_link_face(write_csv(tmp_path / "a.csv", *rows, columns=columns))
+        refuses(part, read_live_link_face, write_csv(tmp_path / "a.csv", *rows, columns=columns))
     with pytest.raises(UserError, match="--fps 24: its frame numbers go up to 29; give more"):
         read_rows(tmp_path, *rows_of("1:0:0:28", "1:0:0:29", "1:0:1:0"), fps=24.0)
     (tmp_path / "b.csv").write_bytes(b"\x81\xff" * 9)
-    with pytest.raises(UserError, match="cannot be read as csv"):
-        read_live_link_face(tmp_path / "b.csv")
+    refuses("cannot be read as csv", read_live_link_face, tmp_path / "b.csv")
 
 
 def test_face_landmarker_results(tmp_path: Path) -> None:
@@ -124,24 +119,20 @@ def test_face_landmarker_results(tmp_path: Path) -> None:
 def test_bad_json_files(tmp_path: Path) -> None:
     good = {"timestamp_ms": 0, "blendshapes": {}}
     for content, part in (
-        ([], "is not a list of frames"),
-        ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
+        ([], "is not a list of frames"), ([{"jawOpen": 1}], 'frame 0: has no "blendshapes"'),
         ([good, good], "frame 1: its timestamp_ms does not come after"),
         ([good, {"blendshapes": {}}], "frame 1: timestamp_ms is None"),
         ([{**good, "timestamp_ms": 5}, good], "frame 1: its timestamp_ms does not come after"),
         ([{"blendshapes": {"jawopen": 1}}], "did you mean jawOpen"),
         ([{"blendshapes": {"jawOpen": float("nan")}}], "jawOpen is nan"),
-        ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"),
-        ([{"blendshapes": None}], "no frame has a face"),
+        ([{"blendshapes": {"jawOpen": 60}}], "jawOpen is 60"), ([{"blendshapes": None}], "no frame has a face"),
         ([{"faceBlendshapes": [{"categories": [{}]}]}], "layout of a FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [1, 2]}]}], "layout of a FaceLandmarker"),
         ([{"faceBlendshapes": [], "facialTransformationMatrixes": [{"data": [0] * 16}]}], "is not a rotation"),
-    ):
-        with pytest.raises(UserError, match=part):
-            read_blendshape_json(write_json(tmp_path / "a.json", content))
+    ):  # fmt: skip
+        refuses(part, read_blendshape_json, write_json(tmp_path / "a.json", content))
     (tmp_path / "a.json").write_text("[{")
-    with pytest.raises(UserError, match="cannot be read as json"):
-        read_blendshape_json(tmp_path / "a.json")
+    refuses("cannot be read as json", read_blendshape_json, tmp_path / "a.json")
 
 
 def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
@@ -162,8 +153,7 @@ def test_an_avatar_does_what_the_phone_saw(tmp_path: Path) -> None:
     # The head's rest pose is where it mostly is: the middle of the turn, which goes to the right.
     torch.testing.assert_close(driven.head_rotation[:, 1], torch.tensor([0.1, 0, -0.1]), atol=1e-5, rtol=0)
     torch.testing.assert_close(driven.head_translation, rest.head_translation.expand(3, -1))
-    with pytest.raises(UserError, match="no landmarks, by which expressions are transferred"):
-        face_of_motion(motion, toy_face_model())
+    refuses("no landmarks, by which expressions are transferred", face_of_motion, motion, toy_face_model())
 
 
 def test_eyes_that_look_up_and_down_stay_open() -> None:
@@ -187,15 +177,12 @@ def test_eyes_that_look_up_and_down_stay_open() -> None:
         assert visible(name, 1.0) > 0.3 * ahead, name
 
 
-def test_a_take_goes_on_after_midnight(tmp_path: Path) -> None:
+def test_a_take_goes_on_after_midnight_and_a_timecode_that_comes_twice_costs_one_row(tmp_path: Path) -> None:
     times = [(23, 59, 58), (23, 59, 59), (0, 0, 0), (0, 0, 1)]
     codes = [f"{h:02d}:{m:02d}:{s:02d}:{f:02d}.451" for h, m, s in times for f in range(0, 60, 2)]
     motion = read_rows(tmp_path, *map(row, codes))
     assert (len(motion), motion.fps) == (120, pytest.approx(30))
     assert motion.notes == ()
-
-
-def test_a_timecode_that_comes_twice_costs_one_row(tmp_path: Path) -> None:
     path, codes = tmp_path / "a.csv", ("1:0:0:0", "1:0:0:1", "1:0:0:1", "1:0:0:0.5", "1:0:0:2", "1:0:0:4")
     motion = read_rows(tmp_path, *rows_of(*codes))
     np.testing.assert_allclose(jaw(motion), [0, 0.1, 0.4, 0.45, 0.5], atol=1e-6)
@@ -237,13 +224,12 @@ def test_every_layout_gives_the_same_motion(write, tmp_path: Path) -> None:
     assert jaw(motion) == [0, 0.125, 0.25, 0.375, 0.5]
     assert motion.coefficients[:, ARKIT_NAMES.index("eyeBlinkLeft")].tolist() == [0.5] * 5
     assert motion.coefficients.sum() == pytest.approx(1.25 + 5 * 0.75)
-    assert motion.fps == pytest.approx(30, rel=0.02)
-    assert motion.notes == ()
+    assert (motion.fps, motion.notes) == (pytest.approx(30, rel=0.02), ())
     if "facial_transformation_matrixes" in path.read_text():
         assert motion.head_translation[0] == pytest.approx([0, 0, -0.4])
 
 
-def test_units_of_times(tmp_path: Path) -> None:
+def test_units_of_times_are_found_and_missing_times_are_said(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
 
     def read(key: str, step: float, count: int = 120) -> Motion:
@@ -258,11 +244,7 @@ def test_units_of_times(tmp_path: Path) -> None:
         ("time", 33.3, 'goes up by 33.3 a frame, so a frame would last 33 s; .*or call milliseconds "timestamp_ms"'),
         ("time", 1e-4, "10,000 frames in a second; give seconds"),
     ):
-        with pytest.raises(UserError, match=words):
-            read(key, step)
-
-
-def test_missing_times_are_said(tmp_path: Path) -> None:
+        refuses(words, read, key, step)
     path = write_json(tmp_path / "a.json", [{"blendshapes": {"jawOpen": 0.5}}] * 3)
     motion = read_blendshape_json(path)
     assert motion.fps == pytest.approx(30)
@@ -292,8 +274,7 @@ def test_names_that_are_not_arkits(tmp_path: Path) -> None:
         ({"names": 3, "frames": [{}]}, "has no list of names"),
         ({"weightMat": []}, '"weightMat" is not a list of frames'),
     ):
-        with pytest.raises(UserError, match=words):
-            read_blendshape_json(write_json(path, content))
+        refuses(words, read_blendshape_json, write_json(path, content))
     turned = {**good, "frames": [{"weights": [0.5], "time": 0.0, "rotation": [0.1, 0.2, 0.3]}]}
     assert '"rotation" is not read' in read_blendshape_json(write_json(path, turned)).notes[0]
 
@@ -306,14 +287,14 @@ def test_transposed_matrices_are_read_and_others_refused(tmp_path: Path) -> None
 
     def read(*matrices: np.ndarray) -> Motion:
         frames: list[dict[str, Any]] = [
-            {"time": index / 30, "face_blendshapes": [], "facial_transformation_matrixes": [one.tolist()]}
+            {"time": index / 30, "face_blendshapes": [[]], "facial_transformation_matrixes": [one.tolist()]}
             for index, one in enumerate(matrices)
         ]
-        frames[0]["face_blendshapes"] = [[]]
         return read_blendshape_json(write_json(path, frames))
 
     plain, other = read(turn, moved, moved), read(turn.T, moved.T, moved.T)
     np.testing.assert_allclose(plain.head_rotation[:, 2], np.arccos(0.8), atol=1e-6)
+    np.testing.assert_allclose(plain.head_translation, [[0, 0, 0], [0, 0, -0.4], [0, 0, -0.4]], atol=1e-6)
     for name in ("head_rotation", "head_translation"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(other, name))
     assert plain.notes == ()
@@ -321,5 +302,4 @@ def test_transposed_matrices_are_read_and_others_refused(tmp_path: Path) -> None
     wrong = moved.copy()
     wrong[3] = [0, 0, 0.5, 1]
     for second in (wrong, moved.T):
-        with pytest.raises(UserError, match="frame 1: the last row of its facial .* not 0 0 0 1"):
-            read(moved, second)
+        refuses("frame 1: the last row of its facial .* not 0 0 0 1", read, moved, second)

@@ -22,6 +22,7 @@ from mien.training.footage.frames import training_frames
 from mien.training.settings import doubly_held_out
 from mien.training.splits.benchmark import with_benchmark_split
 from mien.training.splits.named import SEQUENCES, driving_sequences, split_by_name, with_named_split
+from refusals import refuses
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
 FOLDERS = (
@@ -53,7 +54,7 @@ def test_table_2(subject: str) -> None:
     assert split_by_name(FOLDERS, "104", subject).subject == subject, "a given subject wins over the folder"
 
 
-def test_what_the_names_do_not_say_is_told_with_the_remedy() -> None:
+def test_what_the_names_do_not_say_and_what_is_withheld_twice_is_told() -> None:
     for names, folder, subject, words in (
         (FOLDERS, "me", None, "'me' does not say which subject it is; give --subject (the subjects are 074"),
         (FOLDERS, "104_306", None, "does not say which subject"),
@@ -66,9 +67,6 @@ def test_what_the_names_do_not_say_is_told_with_the_remedy() -> None:
             split_by_name(names, folder, subject)
         assert words in str(told.value)
         assert "\n" not in str(told.value)
-
-
-def test_frames_withheld_twice_are_told() -> None:
     held = TrainSettings(held_out_sequences=("FREE",))
     assert "--split blocks holds out a fifth of each other sequence" in known(doubly_held_out(held))
     assert doubly_held_out(TrainSettings()) is doubly_held_out(replace(held, split="none")) is None
@@ -88,10 +86,8 @@ def test_either_name_of_the_camera_is_held_out() -> None:
         (replace(NAMED, held_out_sequences=("EMO-1",)), None, "--hold-out EMO-1: --split gaussian-avatars decides"),
         (replace(NAMED, held_out_cameras=("03",)), None, "--hold-out-cameras 03: --split gaussian-avatars decides"),
     ):
-        with pytest.raises(UserError, match=words):
-            with_named_split(settings, split, cameras)
-    with pytest.raises(UserError, match="are not filled in"):
-        training_frames([toy_sequence(6, 16)[1]], NAMED)
+        refuses(words, with_named_split, settings, split, cameras)
+    refuses("are not filled in", training_frames, [toy_sequence(6, 16)[1]], NAMED)
 
 
 def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
@@ -119,9 +115,6 @@ def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
             with_benchmark_split(settings, names, dict.fromkeys(names, cameras))
         assert words in str(told.value)
         assert "\n" not in str(told.value)
-
-
-# -- the command line -------------------------------------------------------------------------------------------------
 
 
 first = pytest.fixture(scope="module")(lambda tmp_path_factory: _write_sequence(tmp_path_factory.mktemp("first"), "08"))

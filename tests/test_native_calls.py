@@ -1,7 +1,5 @@
 """Native functions refuse arguments that do not belong together, and survive a lack of memory.
-
-The cases run in another process, since a faulty core may end it. It prints a line of JSON for each case.
-"""
+The cases run in another process, since a faulty core may end it. It prints a line of JSON for each case."""
 
 import json
 import os

@@ -3,8 +3,7 @@
 A new kind of footage is a function that writes a small video, and a row of `ODD`. Videos that are refused are rows of
 `test_capture_from_video::test_nobody_there_is_said_and_why` and `test_bad_requests_are_refused` there.
 
-Of several streams in a file, every reader takes the one that is the video, and the user may choose another.
-"""
+Of several streams in a file, every reader takes the one that is the video, and the user may choose another."""
 
 import json
 import re
@@ -31,8 +30,9 @@ from mien.media.live_camera import LiveCamera
 from mien.media.sound import read_sound
 from mien.media.tone import HLG, srgb_signal
 from mien.media.video import count_frames, probe_video, read_video_frames, write_video
+from mien.pipeline import drive as driving
 from test_capture_parts import streak
-from test_interlaced import flagged, write, write_single_fields
+from test_changing_pictures import flagged, write, write_single_fields
 
 pytestmark = pytest.mark.unchecked
 Face = Callable[..., np.ndarray]
@@ -54,9 +54,6 @@ class Odd:
     """Asserts what is in the capture."""
 
 
-# Light ----------------------------------------------------------------------------------------------------------------
-
-
 def wide(face: Face) -> np.ndarray:
     return np.pad(face(160), ((20, 20), (40, 40), (0, 0)), mode="edge")
 
@@ -75,10 +72,6 @@ def in_green_light(picture: np.ndarray) -> list[np.ndarray]:
     return [np.rint(255 * srgb_signal(light)).astype(np.uint8)] * 4
 
 
-def shaken(picture: np.ndarray) -> list[np.ndarray]:
-    return [picture] * 6 + [streak(picture, 0.07 * 0.46 * 160, 0.0)] * 2 + [picture] * 4
-
-
 def expect_unusable(capture: Capture, face: Face) -> None:
     assert capture.valid.all()
     assert np.flatnonzero(~capture.usable[:, 0]).tolist() == [6, 7]
@@ -87,8 +80,6 @@ def expect_unusable(capture: Capture, face: Face) -> None:
 AGAIN = "warning: clip: the face is {}.*record the video again"
 CAST = "warning: clip: the skin is green \\(red .*white balance"
 PLAIN = {"dark": False, "overexposed": False, "color_cast": None, "frames_blurred": 0, "combs": False}
-
-# Fields ---------------------------------------------------------------------------------------------------------------
 
 
 def woven_heads(face: Face) -> list[np.ndarray]:
@@ -129,7 +120,6 @@ DEINTERLACED = "clip.m..: interlaced; 6 of 6 frames are deinterlaced, each to on
 WHOLE = ("--capture.crop", "none")
 NEVER, ALWAYS = ((*WHOLE, "--capture.deinterlace", mode) for mode in ("never", "always"))
 
-# Times, sizes and turns -----------------------------------------------------------------------------------------------
 
 TICKS = [0, 33, 66, 166, 200, 233]
 
@@ -215,7 +205,8 @@ ODD = {
         partial(filmed, partial(brighter, 1.4)), (AGAIN.format("over-exposed"),), {**PLAIN, "overexposed": True}),
     "green light": Odd(partial(filmed, in_green_light), (CAST,), {"color_cast": "green"}),
     "blurred": Odd(
-        partial(filmed, shaken), ("the face is blurred in 2 of 12 frames",), {"blurred_frames": [6, 7]},
+        partial(filmed, lambda one: [one] * 6 + [streak(one, 0.07 * 0.46 * 160, 0.0)] * 2 + [one] * 4),
+        ("the face is blurred in 2 of 12 frames",), {"blurred_frames": [6, 7]},
         check=expect_unusable),
     "interlaced": Odd(FIELDS, (DEINTERLACED,), {"frames_deinterlaced": 6, "combs": True}, WHOLE),
     "interlaced, kept": Odd(FIELDS, (), {"frames_deinterlaced": 0, "combs": True}, NEVER),
@@ -237,9 +228,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_what_is_said_of_odd_footage(
-    kind: str, test_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_said_of_odd_footage(kind: str, test_data: Path, tmp_path: Path, capsys) -> None:
     odd, face, out = ODD[kind], partial(face_picture, test_data), tmp_path / "out"
     words = ["capture", str(odd.write(tmp_path, face)), "--out", str(out), "--capture.no-cuts", *odd.options]
     assert main(words) == 0
@@ -254,9 +243,6 @@ def test_what_is_said_of_odd_footage(
     hints = [remark.removeprefix("warning: clip: ") for remark in remarks if remark.startswith("warning: clip: ")]
     assert report["hints"] == hints
     odd.check(read_capture(folder), face)
-
-
-# Several streams ------------------------------------------------------------------------------------------------------
 
 
 Track = tuple[int, int, bool]
@@ -322,19 +308,18 @@ def test_the_video_is_found_among_streams(name: str, ending: str, tmp_path: Path
     assert live.picture.shape == (side, side, 3)
 
 
-def test_a_track_of_thousands_of_frames_a_second_is_no_film(tmp_path: Path) -> None:
+def test_the_default_stream_counts_for_sound_too_and_thousands_of_frames_a_second_are_no_film(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_tracks(path, [([flat(128)] * 5, False), ([flat(64)] * 5, False)], (5000, 25))
     assert probe_video(path).stream == 1
-
-
-def test_sound_follows_the_default_too(tmp_path: Path) -> None:
     path, silence = tmp_path / "a.mkv", np.zeros((1, 800), np.int16)
     write_tracks(path, [([silence] * 3, False), ([silence + 8000] * 3, True)], (16000, 16000))
     assert read_sound(path).mean() == pytest.approx(8000 / 32768, abs=1e-3)
 
 
-def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(test_data, tmp_path, capsys) -> None:
+def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(
+    test_data, tmp_path, capsys, monkeypatch
+) -> None:
     path, face = tmp_path / "call.mkv", face_picture(test_data)
     write_tracks(path, [([flat(256)] * 4, False), ([face] * 4, False)])
     command = ["capture", str(path), "--out", str(tmp_path / "out"), "--capture.crop", "none"]
@@ -348,3 +333,10 @@ def test_a_webcam_behind_a_screen_recording_is_named_and_can_be_chosen(test_data
     assert (capture.timesteps, capture.width) == (4, 160)
     with pytest.raises(UserError, match=r"stream 2 is no stream of pictures; .* 0 \(256x256\), 1 \(160x160\)"):
         capture_video(path, tmp_path / "none", CaptureSettings(stream=2))
+    # As a driver, the film has a workspace for each way to capture it.
+    monkeypatch.setattr(driving, "run_tracking_stage", lambda workspace, *_, **__: workspace.sequence_names())
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(UserError, match="add --capture.stream 1$"):
+        driving.tracked_film(path, "anny")
+    workspace, names = driving.tracked_film(path, "anny", CaptureSettings(crop="none", stream=1))
+    assert [read_capture(workspace.sequence_dir(name) / "capture").width for name in names] == [160]

@@ -215,8 +215,7 @@ def test_an_interrupted_fit_goes_on(tmp_path, monkeypatch, start, stops: tuple[i
 
         with monkeypatch.context() as patched:
             patched.setattr(StageCache, "offer", offer_then_stop)
-            with pytest.raises(KeyboardInterrupt):
-                track_subject([case.capture], case.model, settings, keep)
+            pytest.raises(KeyboardInterrupt, track_subject, [case.capture], case.model, settings, keep)
         assert (keep / "descent.safetensors").is_file()
 
     def resume_and_tell(self: Descent, cache: StageCache) -> None:

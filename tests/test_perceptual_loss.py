@@ -56,19 +56,11 @@ def by_torchs_layers(image: torch.Tensor, target: torch.Tensor) -> float:
     return sum(float(conv2d((a - b).square(), factor).mean()) for (a, b), factor in zip(pairs, factors, strict=True))
 
 
-def test_distance_is_that_of_the_networks_layers() -> None:
+def test_the_distance_is_that_of_the_networks_layers_in_crops_of_every_part() -> None:
     features = load_training_features(blocks=2)
     image, target = some_picture(0), some_picture(1)
     assert float(features(target, target)) == 0
     assert float(features(image, target)) == pytest.approx(by_torchs_layers(image, target), rel=1e-3)
-
-
-def some_target(parts: tuple[tuple[int, int, int, int], ...], height: int = 60, width: int = 80) -> Target:
-    picture = torch.zeros(height, width, 3, dtype=torch.uint8)
-    return Target(picture, picture[..., 0], (10, 5, 50, 50), torch.ones(3), parts)
-
-
-def test_crops_lie_in_the_picture_and_visit_every_part() -> None:
     target, settings = some_target(((20, 10, 30, 10), (70, 50, 8, 8))), TrainSettings()
     crops, again = ([drawn_crop(target, 24, crop_random(settings, step)) for step in range(200)] for _ in range(2))
     assert crops == again
@@ -78,6 +70,11 @@ def test_crops_lie_in_the_picture_and_visit_every_part() -> None:
     assert 30 < near_mouth < 110, "a third of the crops is drawn around the part at the corner"
     assert len(set(crops)) > 80, "the others differ"
     assert drawn_crop(target, 512, crop_random(settings, 0)) == (0, 0, 80, 60)
+
+
+def some_target(parts: tuple[tuple[int, int, int, int], ...], height: int = 60, width: int = 80) -> Target:
+    picture = torch.zeros(height, width, 3, dtype=torch.uint8)
+    return Target(picture, picture[..., 0], (10, 5, 50, 50), torch.ones(3), parts)
 
 
 def loss_of(width: int, settings: PerceptualLoss) -> tuple[float, torch.Size]:
@@ -151,9 +148,6 @@ def test_missing_features_are_told_before_the_run_begins(scene, tmp_path, monkey
     with pytest.raises(UserError, match="pip install stlpips-pytorch"):
         train([scene[1]], scene[0], CONFIG, train_toy.SETTINGS, tmp_path / "run", silence)
     assert not (tmp_path / "run").exists()
-
-
-# L1 + SSIM ------------------------------------------------------------------------------------------------------------
 
 
 WHOLE_AND_PARTS = [
@@ -256,7 +250,6 @@ def test_parts_count_again_as_pictures_of_their_own(isa: str, bytes_given: bool)
         cut = photometric_loss_reference(wanted[rows, columns], goal[rows, columns])
         by_hand = by_hand + 1.5 * cut * wanted[rows, columns].numel() / wanted.numel()
     assert float(loss.detach()) == pytest.approx(float(by_hand.detach()), rel=1e-12)
-
     parts = parts[:2]  # the third is too narrow for the native path
     loss = photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
     found = image.clone().requires_grad_()

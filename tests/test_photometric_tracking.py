@@ -160,7 +160,7 @@ def equations_of(case: PhotometricCase, term: OutlineTerm, shift: tuple[float, f
     return term.joint_equations(state, torch.arange(len(state)), subject, batch_of((case.camera,)))
 
 
-def test_the_true_outline_lies_where_the_matte_ends(short_case):
+def test_the_true_outline_lies_where_the_matte_ends_and_pulls_a_shifted_head_back(short_case):
     for timestep, mesh in enumerate(short_case.model(short_case.face)):
         outline = term_of(short_case).outline(mesh, short_case.camera)
         distances = edge_distances(short_case.capture.mattes[timestep, 0], outline, 8.0)
@@ -170,9 +170,6 @@ def test_the_true_outline_lies_where_the_matte_ends(short_case):
         outwards = ((outline.points - outline.points.mean(0)) * outline.normals).sum(1) > 0
         assert outwards.float().mean() > 0.9
         assert edge_distances(np.full((SIZE, SIZE), 255, np.uint8), outline, 8.0).isnan().all(), "out of reach"
-
-
-def test_a_shifted_head_is_pulled_back(short_case):
     shift, term = (0.003, -0.002), term_of(short_case)  # 1.2 and 0.8 pixels
     frames, _ = equations_of(short_case, term, shift)
     step = -torch.linalg.solve(frames.hessian[:, 3:5, 3:5], frames.gradient[:, 3:5])
@@ -249,7 +246,6 @@ def reference(seen: Sighting, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor
     image = seen.picture.image.double()
     by_x, by_y = torch.zeros_like(image), torch.zeros_like(image)
     by_x[:, 1:-1], by_y[1:-1] = (image[:, 2:] - image[:, :-2]) / 2, (image[2:] - image[:-2]) / 2
-
     assert seen.posed.jacobian is not None
     apart = 1e-4 * seen.posed.jacobian.permute(2, 0, 1).double()
     exact, ahead = CAMERA.to(apart), vertices.double()

@@ -28,6 +28,7 @@ from mien.face.loading import add_face_model
 from mien.face.model import Landmarks
 from mien.tracking.scoring_files import scoring_exists
 from mien.training import read_sequence
+from refusals import refuses
 from shared_things import toy_workspace
 from toy_package import blocks, entry_points, help_of, install, mien
 from toy_scene import toy_face_model, toy_sequence
@@ -107,9 +108,7 @@ def assert_imported(folder: Path, path: str, arrays: dict[str, np.ndarray]) -> N
     assert len(settings["fingerprint"]) == 16
 
 
-def test_footage_is_imported_an_avatar_trained_and_exported(
-    cached: Mien, fork_server: ForkServer, tmp_path: Path
-) -> None:
+def test_footage_is_imported_an_avatar_trained_and_exported(cached: Mien, fork_server, tmp_path: Path) -> None:
     arrays, out, me = puppet(), str(tmp_path / "out"), tmp_path / "me.xyz9"
     path = write(tmp_path / "me.puppet9", arrays)
     export, of_file = ("export", out, "--out"), ("export", str(tmp_path / "me.mien"), "--out")
@@ -117,11 +116,9 @@ def test_footage_is_imported_an_avatar_trained_and_exported(
     for line in (
         imports,
         ("train", out, "--method", "mesh_points9", "--method.start-scale", "0.01", "--steps", "2", "--split", "tail"),
-        (*export, str(me)),
-        (*export, str(tmp_path / "me.mien")),
-        (*export, str(tmp_path / "talk.xyz9"), "--series", "me"),
-        (*of_file, str(tmp_path / "again.xyz9")),
-    ):
+        (*export, str(me)), (*export, str(tmp_path / "me.mien")),
+        (*export, str(tmp_path / "talk.xyz9"), "--series", "me"), (*of_file, str(tmp_path / "again.xyz9")),
+    ):  # fmt: skip
         done = cached(*line)
         assert done.returncode == 0, done.stderr
         assert line != imports or "me.puppet9: a puppet" in done.stderr
@@ -214,10 +211,8 @@ def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
 DATASET = "from mien.datasets import Dataset\nIT = Dataset({!r}, 'twice', 'avatar', lambda path: {}, print)\n"
 ENGINE = "from mien.batch import Engine\nIT = Engine('mien_none9:run', packages={})\n"
 EXPORT, IMPORT, BATCH = (
-    "export {run} --out {here}/a.none9",
-    "import {here}/F --out {here}/O",
-    "batch {table} --on none9",
-)
+    "export {run} --out {here}/a.none9", "import {here}/F --out {here}/O", "batch {table} --on none9",
+)  # fmt: skip
 METHOD = "from mien.avatar import Method\nIT = Method('mien_none9:Toy', 'mien_none9:TypoConfig')\n"
 TRAIN = "train {run} --method none9 --run new --steps 2"
 WRONG = (
@@ -301,10 +296,7 @@ def methods_are_found_by_name() -> None:
     assert (has_method("toy"), has_method("nerf")) == (True, False)
     assert method_named("toy") == Method("nowhere:Toy", "nowhere:ToyConfig")
     for part in ("config", "avatar"):
-        with pytest.raises(UserError, match="^nowhere:Toy(Config)?: cannot be imported .*; update or uninstall"):
-            getattr(method_named("toy"), part)
+        refuses("^nowhere:Toy(Config)?: cannot be imported .*; update or uninstall", getattr, method_named("toy"), part)
     assert method_named("headgas") is METHODS["headgas"], "mien's own come first"
-    with pytest.raises(UserError, match="mien-toys-. and mien-toys-. both add 'twice' to mien.methods; uninstall"):
-        method_named("twice")
-    with pytest.raises(UserError, match="no method 'nerf'; give one of gaussian_avatars, .*, toy, twice, or"):
-        method_named("nerf")
+    refuses("mien-toys-. and mien-toys-. both add 'twice' to mien.methods; uninstall", method_named, "twice")
+    refuses("no method 'nerf'; give one of gaussian_avatars, .*, toy, twice, or", method_named, "nerf")

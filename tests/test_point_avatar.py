@@ -13,7 +13,6 @@ from mien.avatar.point_avatar.avatar import PointAvatar, was_drawn
 from mien.avatar.point_avatar.networks import SurfaceNet
 from mien.avatar.point_avatar.settings import PointAvatarConfig
 from mien.avatar.schedules import Progress
-from mien.errors import UserError
 from mien.face import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
@@ -21,8 +20,8 @@ from mien.render import rasterize
 from mien.render.closing import close_holes
 from mien.training import PRESETS
 from plain_settings import plain_point_avatar
-from sh_colors import rgb_from_sh
-from toy_scene import toy_camera, toy_face, toy_face_model
+from refusals import refuses
+from toy_scene import rgb_from_sh, toy_camera, toy_face, toy_face_model
 
 SMALL = plain_point_avatar(points=30, max_points=100, face_points=30)
 
@@ -66,30 +65,34 @@ def test_points_double_and_shrink_together() -> None:
     torch.testing.assert_close(avatar.store["means"].norm(dim=-1), torch.full((400,), 0.125))
 
 
-def test_slopes_are_the_gradients_of_the_distance() -> None:
+def test_slopes_are_the_gradients_of_the_distance_and_losses_hold_points_where_it_is_none() -> None:
     torch.manual_seed(0)
     network, points = SurfaceNet(16, 3, 2).double(), torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     found = network(points)
     torch.testing.assert_close(found.slope, torch.autograd.grad(found.distance.sum(), points)[0])
+    avatar = new_avatar()
+    posed = avatar.pose(toy_face(5)[1], Progress(4, 100))
+    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(32), torch.ones(3))
+    losses = avatar.regularizers(posed, rendering, Progress(4, 100))
+    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
+    torch.testing.assert_close(losses["distance"], surface.distance.square().mean())
+    torch.testing.assert_close(losses["slope"], 0.1 * (surface.slope.norm(dim=-1) - 1).square().mean())
+    assert set(losses) >= {"skinning", "expression_directions"}
 
 
-def test_a_color_is_albedo_times_light_on_the_normal() -> None:
+def test_a_color_is_albedo_times_light_on_the_normal_which_turns_with_the_head() -> None:
     avatar = new_avatar()
     surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
     normals = torch.nn.functional.normalize(surface.slope, dim=-1)
     expected = surface.albedo.sigmoid() * avatar.shading(normals)
     torch.testing.assert_close(colors(avatar, toy_face(5)[2]), expected)
     assert new_avatar(disturbed=False).shading(normals).unique().tolist() == [1.0]
-
-
-def test_light_follows_deformed_normals_as_the_head_turns() -> None:
     avatar, still, face = new_avatar(replace(SMALL, normals="deformed")), new_avatar(), toy_face(5)[2]
     turned = replace(face, head_rotation=face.head_rotation + torch.tensor([0.0, 1.0, 0.0]))
     assert (colors(avatar, face) - colors(avatar, turned)).abs().max() > 1e-3
-    with pytest.raises(UserError, match=r"^the setting normals deformed of point_avatar: .*export a \.ply"):
-        avatar.bake()
+    refuses(r"^the setting normals deformed of point_avatar: .*export a \.ply", avatar.bake)
     torch.testing.assert_close(colors(still, face), colors(still, turned))
     # Points on rigid bones have normals that turn with them.
     last = avatar.deformation.skinning
@@ -116,17 +119,6 @@ def test_points_that_others_hide_are_not_drawn() -> None:
     (rendering.image * torch.linspace(0, 1, 32)[:, None]).sum().backward()
     seen = was_drawn(gaussians, rendering)
     assert (seen[0], seen[4]) == (1, 0)
-
-
-def test_losses_hold_points_on_a_surface_whose_slope_is_one() -> None:
-    avatar = new_avatar()
-    posed = avatar.pose(toy_face(5)[1], Progress(4, 100))
-    rendering = rasterize(posed.gaussians.timestep(0), toy_camera(32), torch.ones(3))
-    losses = avatar.regularizers(posed, rendering, Progress(4, 100))
-    surface = avatar.surface_net(avatar.store["means"].detach() / LENGTH_UNIT)
-    torch.testing.assert_close(losses["distance"], surface.distance.square().mean())
-    torch.testing.assert_close(losses["slope"], 0.1 * (surface.slope.norm(dim=-1) - 1).square().mean())
-    assert set(losses) >= {"skinning", "expression_directions"}
 
 
 def test_closing_fills_bright_specks_and_keeps_the_rest() -> None:

@@ -1,10 +1,27 @@
-"""The network of points has the right softplus everywhere. tests/test_training_native.py compares it with its twin."""
+"""The network of points has the right softplus everywhere, and avatars with networks pose their baked form as numpy."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
+from known import known
+from mien import runtime
+from mien.avatar import Avatar, load_avatar
+from mien.avatar.files import write_avatar
+from mien.avatar.headgas.avatar import HeadGas
+from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
-from toy_scene import random
+from mien.avatar.schedules import Progress
+from mien.face import FaceParams
+from mien.runtime import posing
+from mien.runtime.baked import BlendSkinned
+from mono_avatars import new_avatar
+from plain_settings import plain_mono_gaussian_avatar
+from toy_scene import random, runtime_face, toy_face, toy_face_model
 
 Sizes = tuple[int, int, tuple[tuple[int, Activation, int | None], ...]]
 """Points, inputs, and outputs, activation and extra values of each layer."""
@@ -58,3 +75,101 @@ def test_softplus_over_its_whole_range(isa: str) -> None:
     expected = torch.nn.functional.softplus(inputs.double(), beta=100)
     torch.testing.assert_close(outputs.double(), expected, atol=2e-8, rtol=1e-6)
     torch.testing.assert_close(slope.double(), (100 * inputs.double()).sigmoid(), atol=2e-5, rtol=0)
+
+
+PARTS = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
+with_networks = pytest.mark.parametrize("method", ["headgas", "mono_gaussian_avatar"])
+
+
+def moved_avatar(method: str) -> Avatar:
+    """An avatar whose networks all do something, and which is not in training mode."""
+    if method == "headgas":
+        torch.manual_seed(0)
+        avatar: Avatar = HeadGas(HeadGasConfig(points=50, directions=3), toy_face_model(), toy_face(5))
+        avatar.gaussian_store().assign("bases", torch.randn(avatar.gaussian_store()["bases"].shape))
+    else:
+        avatar = new_avatar()
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
+    avatar.eval()
+    return avatar
+
+
+def difference(avatar: Avatar, face: FaceParams) -> float:
+    """The largest difference of any property between the baked form and the networks."""
+    baked = avatar.pose(face).gaussians
+    avatar.train()
+    own = avatar.pose(face).gaussians
+    avatar.eval()
+    own = replace(own, quats=torch.nn.functional.normalize(own.quats, dim=-1).expand_as(baked.quats))
+    own = replace(own, means=own.means.expand_as(baked.means), scales=own.scales.expand_as(baked.scales))
+    pairs = [(getattr(baked, name), getattr(own, name)) for name in PARTS]
+    assert all(a.shape == b.shape for a, b in pairs)
+    return max(float((a - b).detach().abs().max()) for a, b in pairs)
+
+
+@with_networks
+def test_the_baked_form_is_what_the_networks_give(method: str, tmp_path: Path) -> None:
+    avatar, face = moved_avatar(method), toy_face(5)
+    assert difference(avatar, face) < 1e-5
+    assert not avatar.pose(face).gaussians.means.requires_grad
+    write_avatar(tmp_path, avatar)
+    loaded = load_avatar(tmp_path)
+    assert not loaded.training
+    assert torch.equal(loaded.pose(face).gaussians.sh, avatar.pose(face).gaussians.sh)
+    assert difference(loaded, face) < 1e-5
+    with torch.no_grad():
+        avatar.gaussian_store()["means"].mul_(0.9)
+    assert difference(avatar, face) < 1e-5
+    avatar.gaussian_store().select(torch.arange(3))
+    assert avatar.pose(face).gaussians.means.shape == (5, 3, 3)
+
+
+@with_networks
+def test_it_is_baked_once_and_not_for_gradients_or_a_step(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    avatar, face = moved_avatar(method), toy_face(5)[0]
+    bake, calls = avatar.bake, []
+    monkeypatch.setattr(avatar, "bake", lambda: (calls.append(0), bake())[1])
+    wanted = replace(face, expression=face.expression.clone().requires_grad_())
+    posed = avatar.pose(wanted).gaussians
+    (posed.means.sum() + posed.sh.square().sum()).backward()
+    assert known(wanted.expression.grad).any()
+    assert avatar.pose(face, Progress(0, 10, 0, 1.0)).gaussians.sh.requires_grad
+    assert not calls
+    avatar.pose(face)
+    avatar.pose(toy_face(5)[1])
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("sizes", NETWORKS, ids=lambda sizes: f"{sizes[0]} points")
+def test_outputs_alone_have_the_bits_of_those_with_gradients(isa: str, sizes: Sizes) -> None:
+    inputs, *parameters = arguments(sizes)
+    alone = point_network(inputs, layers_of(sizes, parameters))
+    assert torch.equal(alone, point_network(inputs.requires_grad_(), layers_of(sizes, parameters)).detach())
+
+
+def baked_avatar(points: int) -> BlendSkinned:
+    return new_avatar(plain_mono_gaussian_avatar(points=points)).bake()
+
+
+def test_activations_have_the_bits_of_numpy(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    baked, face = baked_avatar(3000), runtime_face(toy_face(5)[3])
+    found = runtime.pose(baked, face)
+    monkeypatch.setattr(posing, "has_native_activations", lambda baked: False)
+    expected = runtime.pose(baked, face)
+    for name in PARTS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), strict=True, err_msg=name)
+
+
+def test_other_avatars_keep_the_path_of_numpy() -> None:
+    baked = baked_avatar(20)
+    assert posing.has_native_activations(baked)
+    network = known(baked.network)
+    for change in (
+        {"network": None}, {"network": replace(network, activation="softplus")},
+        {"network": replace(network, outputs=("sh",))}, {"scale_activation": "exp"}, {"color_activation": "sh"},
+        {"attributes": replace(baked.attributes, sh=np.zeros((20, 4, 3), np.float32))},
+    ):  # fmt: skip
+        assert not posing.has_native_activations(replace(baked, **change)), change

@@ -1,10 +1,10 @@
-"""The native rasterizer agrees with the float64 reference, forward and backward, and the reference with differences.
-
-All draw the same picture as another program (gsplat).
-"""
+"""The native rasterizer agrees with the float64 reference, forward and backward, and keeps its contract."""
 
 import math
+import multiprocessing
+import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,9 +15,12 @@ from torch import Tensor
 from instruction_sets import ISAS
 from known import known
 from mien import _native
-from mien.camera import camera_from_fov
-from mien.gaussians import Gaussians
-from mien.render.rasterize import Backend
+from mien.camera import Camera, camera_from_fov
+from mien.errors import UserError
+from mien.gaussians import Gaussians, sh_from_rgb
+from mien.render import rasterize as rasterize_in_place
+from mien.render.rasterize import Backend, choose_backend
+from mien.render.validation import drawable
 from needs import use_instructions
 from rasterize_scenes import (
     GSPLAT,
@@ -29,6 +32,8 @@ from rasterize_scenes import (
     rasterize_anywhere,
     render,
 )
+from rasterize_scenes import rasterize_anywhere as rasterize
+from refusals import refuses
 
 BACKENDS = ["native", GSPLAT]
 
@@ -115,3 +120,183 @@ def test_tiny_case_matches_the_picture_that_gsplat_made(test_data: Path, backend
     picture = torch.cat([rendering.image, rendering.alpha[..., None]], -1)
     # Measured 1e-6: the same arithmetic in another order; 1e-4 would show a wrong constant (dilation, cutoff, clamp).
     torch.testing.assert_close(picture, stored["out_img"], rtol=0, atol=1e-5)
+
+
+ALL_BACKENDS = ["native", "reference", GSPLAT]
+
+
+def one_gaussian(depth: float = 1.0, opacity: float = 0.8, scale: float = 0.02) -> Gaussians:
+    """Return an orange ball on the optical axis."""
+    return Gaussians(
+        means=torch.tensor([[0.0, 0.0, float(depth)]]), quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), scale), opacities=torch.tensor([float(opacity)]),
+        sh=sh_from_rgb(torch.tensor([[[1.0, 0.5, 0.1]]])),
+    )  # fmt: skip
+
+
+def front_camera(width: int = 21, height: int = 15) -> Camera:
+    K = torch.tensor([[60.0, 0, width / 2], [0, 60.0, height / 2], [0, 0, 1]])
+    return Camera(K, torch.eye(4), width, height)
+
+
+def stacked(scenes: list[Scene]) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
+    return Gaussians(**{name: torch.stack([getattr(s.gaussians, name) for s in scenes]) for name in names})
+
+
+@pytest.mark.parametrize("backend", ALL_BACKENDS)
+def test_balls_on_the_axis_show_their_colors_at_the_center(backend: Backend) -> None:
+    rendering = rasterize(one_gaussian(), front_camera(), torch.zeros(3), backend)
+    assert rendering.alpha[7, 10].item() == pytest.approx(0.8, abs=1e-4)
+    torch.testing.assert_close(rendering.image[7, 10], 0.8 * torch.tensor([1.0, 0.5, 0.1]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(rendering.image, rendering.image.flip(0).flip(1), atol=1e-5, rtol=0)
+    variance = (60 * 0.02) ** 2 + 0.3
+    assert rendering.alpha[7, 12].item() == pytest.approx(0.8 * math.exp(-0.5 * 2**2 / variance), abs=1e-5)
+    assert rendering.radii.tolist() == [math.ceil(3 * variance**0.5)]
+    # Nearer ones hide farther ones, and ties go by the index.
+    means = torch.tensor([[0.0, 0, 1.1], [0, 0, 1], [0, 0, 1]])
+    three = replace(one_gaussian().select(torch.tensor([0, 0, 0])), means=means, sh=sh_from_rgb(torch.eye(3))[:, None])
+    seen = rasterize(three, front_camera(), torch.zeros(3), backend).image[7, 10]
+    torch.testing.assert_close(seen, torch.tensor([0.8 * 0.04, 0.8, 0.8 * 0.2]), atol=1e-3, rtol=0)
+    # A clamped alpha has no gradient.
+    large = replace(one_gaussian(scale=5.0), opacities=torch.ones(1, requires_grad=True))
+    alpha = rasterize(large, front_camera(), torch.zeros(3), backend).alpha[7, 10]
+    assert alpha.item() == pytest.approx(0.999, abs=1e-6)
+    assert torch.autograd.grad(alpha, large.opacities)[0].item() == 0
+
+
+@pytest.mark.parametrize("backend", ALL_BACKENDS)
+def test_batches_equal_their_single_pictures(backend: Backend) -> None:
+    scenes = [random_scene(seed, count=50) for seed in range(3)]
+    cameras, background = [scene.camera for scene in scenes], scenes[0].background
+    singles = [rasterize(s.gaussians, s.camera, background, backend) for s in scenes]
+    batch = rasterize(stacked(scenes), cameras, background, backend)
+    for name in ("image", "radii", "alpha"):
+        assert torch.equal(getattr(batch, name), torch.stack([getattr(single, name) for single in singles]))
+    shared = replace(stacked(scenes), sh=scenes[0].gaussians.sh)
+    for index, entry in enumerate(shared.timesteps()):
+        assert all(
+            torch.equal(known(a), known(b))
+            for a, b in zip(vars(entry).values(), vars(shared.timestep(index)).values(), strict=True)
+        )
+    one_camera = rasterize(stacked(scenes), cameras[1], background, backend)
+    assert torch.equal(one_camera.image[1], singles[1].image)
+    one_scene = rasterize(scenes[1].gaussians, cameras, background, backend)
+    assert torch.equal(one_scene.image[1], singles[1].image)
+    assert rasterize(scenes[1].gaussians, cameras[:1], background, backend).image.shape == (1, 45, 61, 3)
+    assert one_scene.means2d_offset.requires_grad
+    with torch.no_grad():
+        fixed = rasterize(scenes[1].gaussians, cameras, background, backend)
+    assert not fixed.image.requires_grad
+    assert not fixed.means2d_offset.requires_grad
+
+
+@pytest.mark.parametrize("backend", ALL_BACKENDS)
+def test_means2d_gradient_is_per_pixel_of_motion(backend: Backend) -> None:
+    gaussians, camera = one_gaussian(), front_camera()
+    rendering = rasterize(gaussians, camera, torch.zeros(3), backend)
+    rendering.alpha[7, 12].backward()
+    moved = replace(camera, K=camera.K + torch.tensor([[0, 0, 1e-2], [0, 0, 0], [0, 0, 0]]))
+    change = rasterize(gaussians, moved, torch.zeros(3), backend).alpha[7, 12] - rendering.alpha[7, 12]
+    gradient = known(rendering.means2d_offset.grad)
+    assert gradient[0, 0].item() == pytest.approx(change.item() / 1e-2, rel=2e-2)
+    assert gradient[0, 1].abs() < 1e-6
+
+
+@pytest.mark.parametrize("backend", ALL_BACKENDS)
+def test_nothing_to_see_is_background(backend: Backend) -> None:
+    background = torch.tensor([0.1, 0.2, 0.3])
+    for name, gaussians in {
+        "behind": one_gaussian(depth=-1), "at the near plane": one_gaussian(depth=0.01),
+        "transparent": one_gaussian(opacity=0), "below 1/255": one_gaussian(opacity=1 / 256),
+        "beside the picture": replace(one_gaussian(), means=torch.tensor([[10.0, 0, 1]])),
+        "none": one_gaussian().select(torch.zeros(1, dtype=torch.bool)),
+    }.items():  # fmt: skip
+        means = gaussians.means.clone().requires_grad_()
+        rendering = rasterize(replace(gaussians, means=means), front_camera(), background, backend)
+        assert torch.equal(rendering.image, background.expand(15, 21, 3)), name
+        assert not rendering.alpha.any(), name
+        assert not rendering.radii.any(), name
+        assert not torch.autograd.grad(rendering.image.sum(), means)[0].any(), name
+
+
+@pytest.mark.parametrize("backend", ALL_BACKENDS)
+def test_what_is_not_finite_is_named(backend: Backend) -> None:
+    camera = random_scene(3).camera
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        for value in (torch.nan, torch.inf, -torch.inf):
+            gaussians = random_scene(3, count=40).gaussians
+            gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
+            gaussians.opacities[17] = 0.5
+            getattr(gaussians, name).view(40, -1)[17, -1] = value
+            with pytest.raises(ValueError, match=rf"{name}\[17.* is -?(nan|inf)"):
+                rasterize(gaussians, camera, torch.zeros(3), backend)
+    broken = replace(camera, viewmat=torch.full((4, 4), torch.nan))
+    for given, background, words in (
+        (broken, 0.0, r"camera.viewmat\[0, 0\] is nan"),
+        ([camera, broken, camera], 0.0, r"camera.viewmat\[0, \d\] is nan"),
+        (camera, torch.inf, r"background\[1\] is inf"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            rasterize(one_gaussian(), given, torch.tensor([0.0, background, 0.0]), backend)
+
+
+def test_layouts_and_dtypes() -> None:
+    scene = random_scene(4)
+    spread = {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    spread = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in spread.items()}
+    assert not spread["means"].is_contiguous()
+    found = rasterize(replace(scene.gaussians, **spread), scene.camera, scene.background, "native")
+    assert torch.equal(found.image, rasterize(scene.gaussians, scene.camera, scene.background, "native").image)
+    double = scene.to(torch.float64)
+    assert rasterize(double.gaussians, double.camera, double.background).image.dtype == torch.float64
+    with pytest.raises(ValueError, match="takes float32 CPU tensors, got torch.float64"):
+        rasterize(double.gaussians, double.camera, double.background, "native")
+    with pytest.raises(ValueError, match="quats is torch.float64"):
+        rasterize(replace(scene.gaussians, quats=double.gaussians.quats), scene.camera, scene.background)
+    assert [choose_backend(one.background) for one in (scene, double)] == ["native", "reference"]
+
+
+def test_what_does_not_fit_or_cannot_be_counted_is_refused() -> None:
+    scenes = [random_scene(seed) for seed in range(3)]
+    one, cameras = scenes[0].gaussians, [scene.camera for scene in scenes]
+    for gaussians, given, words in (
+        (stacked(scenes), cameras[:2], "3 timesteps of Gaussians but 2 cameras"),
+        (one, [cameras[0], front_camera()], "must have one size"),
+        (one, [], "is empty"),
+        (random_scene(0, coefficients=5).gaussians, cameras[0], "sh has shape"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            rasterize(gaussians, given, torch.zeros(3))
+    count, width = 70_000, 1_048_544  # each Gaussian touches all of 32,767 tiles
+    gaussians = one_gaussian(scale=3.0).select(torch.zeros(count, dtype=torch.long))
+    gaussians.means[:, 2] += torch.linspace(0, 1, count)
+    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), 0.5], [0, 0, 1]])
+    words = r"^it: cannot be drawn \(too many pairs .*\); do something else$"
+    with pytest.raises(UserError, match=words), drawable("it", "do something else"):
+        rasterize_in_place(gaussians, Camera(K, torch.eye(4), width, 1), torch.ones(3), backend="native")
+
+
+def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
+    _native.set_thread_count(3)  # joins the threads of the old pool, and hangs if that is still the parent's
+    queue.put(rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist())
+
+
+def test_a_forked_child_renders() -> None:
+    """Threads do not survive a fork, so the pool must notice it."""
+    _native.set_thread_count(2)
+    scene = random_scene(0)
+    expected = rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist()
+    rasterize(scene.gaussians, scene.camera, scene.background, "native")
+    context = multiprocessing.get_context("fork")
+    queue: multiprocessing.Queue[list[float]] = context.Queue()
+    child = context.Process(target=_render_in_child, args=(queue,), daemon=True)
+    child.start()
+    assert queue.get(timeout=60) == expected
+    child.join(timeout=60)
+    _native.set_thread_count(0)
+
+
+def test_gsplat_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    refuses("pip install gsplat==", rasterize_in_place, one_gaussian(), front_camera(), torch.zeros(3), "gsplat")

@@ -14,20 +14,13 @@ from mien.render import Rendering, rasterize
 from rasterize_scenes import Scene, assert_matches_reference, random_scene, relative_error
 
 ODDITIES: dict[str, dict[str, list[float] | float]] = {
-    "zero quaternion": {"quats": 0.0},
-    "short quaternion": {"quats": [0.01, 0.003, -0.002, 0.004]},
-    "no extent": {"scales": 0.0},
-    "needle": {"scales": [0.3, 1e-5, 1e-5]},
-    "disc": {"scales": [0.2, 0.2, 0.0]},
-    "huge": {"scales": [2.0, 3.0, 1.0], "opacities": 0.2},
-    "transparent": {"opacities": 0.0},
-    "opaque": {"opacities": 1.0},
-    "behind the camera": {"means": [0.0, 0.0, -0.5]},
-    "on the camera": {"means": [0.0, 0.0, 0.0]},
-    "touching the camera": {"means": [0.0, 0.0, 0.0101]},
-    "far outside": {"means": [50.0, 0.0, 0.3]},
-    "far away": {"means": [0.0, 0.0, 1e4]},
-}
+    "zero quaternion": {"quats": 0.0}, "short quaternion": {"quats": [0.01, 0.003, -0.002, 0.004]},
+    "no extent": {"scales": 0.0}, "needle": {"scales": [0.3, 1e-5, 1e-5]}, "disc": {"scales": [0.2, 0.2, 0.0]},
+    "huge": {"scales": [2.0, 3.0, 1.0], "opacities": 0.2}, "transparent": {"opacities": 0.0},
+    "opaque": {"opacities": 1.0}, "behind the camera": {"means": [0.0, 0.0, -0.5]},
+    "on the camera": {"means": [0.0, 0.0, 0.0]}, "touching the camera": {"means": [0.0, 0.0, 0.0101]},
+    "far outside": {"means": [50.0, 0.0, 0.3]}, "far away": {"means": [0.0, 0.0, 1e4]},
+}  # fmt: skip
 """What is odd about a Gaussian. Means are in the camera's frame."""
 
 
@@ -76,8 +69,7 @@ def test_depth_is_the_expected_depth() -> None:
     scale, quat, opacity = torch.full((1, 3), 0.05), torch.eye(4)[:1], torch.tensor([0.7])
     ball = Gaussians(means, quat, scale, opacity, torch.zeros(1, 1, 3))
     depth = known(rasterize(ball, [camera, camera], depth=True).depth)
-    assert depth.shape == (2, 11, 11)
-    assert depth[0, 5, 5].item() == pytest.approx(1.25, abs=1e-5)
+    assert (depth.shape, depth[0, 5, 5].item()) == ((2, 11, 11), pytest.approx(1.25, abs=1e-5))
     (gradient,) = torch.autograd.grad(depth[1, 5, 5], means)
     torch.testing.assert_close(gradient, torch.tensor([[0.0, 0.0, 1.0]]), atol=1e-3, rtol=0)
 

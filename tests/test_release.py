@@ -49,7 +49,7 @@ def listed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return {canonical(each["name"]): each for each in (*told["parts"], *told["packages"])}
 
 
-def test_no_package_has_changed_the_kind_of_its_licence_and_none_forbids_commercial_use():
+def test_no_package_has_changed_the_kind_of_its_licence_and_kinds_are_read_from_expressions():
     """A new package, or another licence, is looked at by a person, who then changes `licence_kinds.json`."""
     kinds = json.loads((ROOT / "tests/licence_kinds.json").read_text())
     recorded = {name: kind for kind, names in kinds.items() for name in names}
@@ -57,23 +57,16 @@ def test_no_package_has_changed_the_kind_of_its_licence_and_none_forbids_commerc
     changed = {name: kind for name, kind in found.items() if recorded.get(name, "not recorded") != kind}
     assert changed == {}, "look at these licences, and record their kinds in tests/licence_kinds.json"
     assert "unknown" not in {*found.values(), *(kind_of(part.licence) for part in PARTS)}
-
-
-def test_kinds_of_expressions():
     for expression, kind in {
-        "MIT": "permissive",
-        "MIT-0": "public domain",
-        "MIT OR GPL-2.0-or-later": "permissive",
-        "BSD-3-Clause AND LGPL-2.1-or-later": "weak copyleft",
-        "MPL-2.0 AND MIT": "weak copyleft",
+        "MIT": "permissive", "MIT-0": "public domain", "MIT OR GPL-2.0-or-later": "permissive",
+        "BSD-3-Clause AND LGPL-2.1-or-later": "weak copyleft", "MPL-2.0 AND MIT": "weak copyleft",
         "Apache-2.0 AND (MIT OR LicenseRef-NVIDIA-Proprietary)": "permissive",
-        "GPL-2.0-or-later": "strong copyleft",
-        "MIT AND CC-BY-NC-4.0": "unknown",
-    }.items():
+        "GPL-2.0-or-later": "strong copyleft", "MIT AND CC-BY-NC-4.0": "unknown",
+    }.items():  # fmt: skip
         assert kind_of(expression) == kind, expression
 
 
-def test_every_package_is_named_with_what_brings_it(listed: dict[str, Any], capsys: pytest.CaptureFixture[str]):
+def test_every_package_is_named_with_what_brings_it_as_pip_licenses_lists_it(listed: dict[str, Any], capsys):
     used = {name: listed[name]["used_for"] for name in ("numpy", "torch", "kiwisolver", "viser")}
     assert list(used.values()) == ["mien", "mien[create]", "mien[create], by matplotlib", "mien[viewer]"]
     x264 = listed[canonical("x264 and x265")]
@@ -81,10 +74,7 @@ def test_every_package_is_named_with_what_brings_it(listed: dict[str, Any], caps
     assert "pip install --no-binary av av" in x264["meaning"]
     assert main(["licenses"]) == 0
     assert "keep its notices when you pass it on" in capsys.readouterr().out
-
-
-def test_the_list_is_that_of_pip_licenses(listed: dict[str, Any]):
-    """Row by row: the same packages and versions, and what both read as the declared licence."""
+    # Row by row: the same packages and versions, and what both read as the declared licence.
     command = [sys.executable, "-m", "piplicenses", "--format=json", "--with-system", "--from=mixed"]
     theirs = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert {canonical(row["Name"]) for row in theirs} == {name for name, own in listed.items() if "version" in own}
@@ -95,15 +85,12 @@ def test_the_list_is_that_of_pip_licenses(listed: dict[str, Any]):
             assert row["License"] == own["declared"], row["Name"]
 
 
-def test_the_bill_of_materials_in_the_wheel_is_up_to_date():
+def test_the_bill_of_materials_is_up_to_date_and_mediapipe_older_than_its_statistics():
     written = json.loads((ROOT / "src/mien/sbom.spdx.json").read_text(encoding="utf-8"))
     expected = spdx_document(PROJECT["version"], requirements_of(PROJECT))
     assert written == expected, "run: python -m mien.licences pyproject.toml > src/mien/sbom.spdx.json"
     assert {"numpy", "torch", "mediapipe", "nanobind", "mien"} <= {each["name"] for each in written["packages"]}
-
-
-def test_mediapipe_is_older_than_its_statistics():
-    """From 0.10.35 on, mediapipe declares that it sends usage metrics to its maker (docs/platforms.md)."""
+    # From 0.10.35 on, mediapipe declares that it sends usage metrics to its maker (docs/platforms.md).
     asked = next(line for line in PROJECT["optional-dependencies"]["create"] if line.startswith("mediapipe"))
     pinned = asked.partition(";")[0].removeprefix("mediapipe==").strip()
     assert tuple(map(int, pinned.split("."))) < (0, 10, 35)

@@ -75,9 +75,6 @@ def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-# -- options ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_without_options_a_run_has_the_defaults(method: str, choices: Any) -> None:
     config = METHODS[method].config()
@@ -101,7 +98,7 @@ def test_a_preset_that_the_method_does_not_have_is_refused(workspace, capsys, mo
     assert words in complaint(capsys, [*line, "--preset", "paper"])
 
 
-def test_options_reach_every_depth_of_the_method(choices: Any) -> None:
+def test_options_reach_every_depth_and_win_over_the_file_and_the_file_over_the_preset(choices: Any) -> None:
     line = """--method.sh-degree 2 --method.sh-frame head --method.density.max-gaussians=20000 --training.resolution 256
         --method.means-rate.start 4e-3 --method.means-rate.end 4e-5 --method.photometric.alpha_weight 0.1 --steps 70
         --method.density.opacity-resets 0.2 0.5 --training.threads 1 --method.face-tuning.head-translation.begin 0.5"""
@@ -114,6 +111,29 @@ def test_options_reach_every_depth_of_the_method(choices: Any) -> None:
     assert choices(line) == (config, replace(RUN, steps=70, resolution=256, threads=1))
     config, _ = choices("--method headgas --method.features 8 --method.density.rounds 3")
     assert config == HeadGasConfig(features=8, density=replace(HeadGasConfig().density, rounds=3))
+    file = {
+        "method": {"kind": "headgas", "features": 32, "density": {"rounds": 5}},
+        "settings": {"steps": 2000, "seed": 3, "held_out_sequences": ["smile"], "record_every": 7},
+    }
+    config = HeadGasConfig(features=32, density=replace(HeadGasConfig().density, rounds=5))
+    run = replace(RUN, steps=2000, seed=3, record_every=7)
+    paper: Any = PRESETS["paper"].config("gaussian_avatars")
+    other = {"method": {"sh_degree": 2}, "settings": {"steps": 700, "seed": 4}}
+    for line, given, expected in (
+        ("--preset paper", None, (paper, replace(OPEN, steps=600_000))),
+        ("--preset paper --steps 30", other, (replace(paper, sh_degree=2), replace(OPEN, steps=30, seed=4))),
+        ("--preset paper --method.sh-degree 1", other, (replace(paper, sh_degree=1), replace(OPEN, steps=700, seed=4))),
+        ("--hold-out", file, (config, run)),
+        (
+            "--hold-out --method.features 8 --steps 50 --preset draft --seed 0",
+            file,
+            (replace(config, features=8), replace(run, steps=50, seed=0)),
+        ),
+        ("--method headgas", {"settings": {"seed": 1}}, (HeadGasConfig(), replace(RUN, seed=1))),
+        ("", {}, choices("")),
+    ):
+        assert choices(line, given) == expected
+    assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == replace(RUN, steps=4000, split="tail")
 
 
 @pytest.mark.parametrize("line", ["--no-face-tuning", "--method.face-tuning.enabled False"])
@@ -147,35 +167,6 @@ def test_options_that_make_no_sense_are_refused_before_any_work(line: str, words
     assert not new.exists()
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
-def test_options_win_over_the_file_and_the_file_over_the_preset(choices: Any) -> None:
-    file = {
-        "method": {"kind": "headgas", "features": 32, "density": {"rounds": 5}},
-        "settings": {"steps": 2000, "seed": 3, "held_out_sequences": ["smile"], "record_every": 7},
-    }
-    config = HeadGasConfig(features=32, density=replace(HeadGasConfig().density, rounds=5))
-    run = replace(RUN, steps=2000, seed=3, record_every=7)
-    paper: Any = PRESETS["paper"].config("gaussian_avatars")
-    other = {"method": {"sh_degree": 2}, "settings": {"steps": 700, "seed": 4}}
-    for line, given, expected in (
-        ("--preset paper", None, (paper, replace(OPEN, steps=600_000))),
-        ("--preset paper --steps 30", other, (replace(paper, sh_degree=2), replace(OPEN, steps=30, seed=4))),
-        ("--preset paper --method.sh-degree 1", other, (replace(paper, sh_degree=1), replace(OPEN, steps=700, seed=4))),
-        ("--hold-out", file, (config, run)),
-        (
-            "--hold-out --method.features 8 --steps 50 --preset draft --seed 0",
-            file,
-            (replace(config, features=8), replace(run, steps=50, seed=0)),
-        ),
-        ("--method headgas", {"settings": {"seed": 1}}, (HeadGasConfig(), replace(RUN, seed=1))),
-        ("", {}, choices("")),
-    ):
-        assert choices(line, given) == expected
-    assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == replace(RUN, steps=4000, split="tail")
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -207,21 +198,16 @@ def test_files_that_make_no_sense_are_refused_before_any_work(content: str, word
     assert not (workspace / "runs").exists()
 
 
-def test_paths_that_are_no_file_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_paths_that_are_no_file_and_files_of_another_method_are_refused(workspace: Path, capsys) -> None:
     runs = workspace / "runs"
     (runs / "a").mkdir(parents=True)
     (runs / "a" / "config.json").touch()
     for path, words in (
         (workspace / "gone.json", "gone.json: no such file"),
-        (runs / "a", f"is a folder; give {runs / 'a' / 'config.json'}"),
-        (runs, "is a folder; give a file"),
-        ("/dev/null", "is not an ordinary file"),
-        ("", "--config= is empty"),
-    ):
+        (runs / "a", f"is a folder; give {runs / 'a' / 'config.json'}"), (runs, "is a folder; give a file"),
+        ("/dev/null", "is not an ordinary file"), ("", "--config= is empty"),
+    ):  # fmt: skip
         assert words in complaint(capsys, ["train", str(workspace), f"--config={path}"])
-
-
-def test_a_file_of_another_method_than_asked_for_is_refused(workspace: Path, capsys: Any) -> None:
     words = [*with_file(workspace, '{"method": {"kind": "headgas"}}'), "--method", "gaussian_avatars"]
     assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, words)
 

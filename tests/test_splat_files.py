@@ -28,6 +28,7 @@ from mien.formats.usd import read_usd, write_usd
 from mien.gaussians import Gaussians
 from mien.rotation import multiply_quaternions
 from needs import NO_PACKAGE, NO_SPLAT_TRANSFORM
+from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from web_case import WEB, drawn_head, node
 
@@ -55,10 +56,8 @@ def some(n: int, coefficients: int, seed: int = 0) -> Gaussians:
 @dataclass(frozen=True)
 class Loss:
     """Largest differences that a format may make; `color` is the first SH coefficient, and `higher` are the others.
-
     By default there are none. Rotations agree to float32: their angle is the arc cosine of a number next to 1, which
-    has half of the digits.
-    """
+    has half of the digits."""
 
     meters: float = 0
     radians: float = 2e-3
@@ -79,13 +78,10 @@ def expect_near(found: Gaussians, expected: Gaussians, loss: Loss) -> None:
     same = [multiply_quaternions(wanted, half.expand_as(wanted)) for half in torch.eye(4, dtype=torch.float64)]
     cosines = torch.stack([(turns * one).sum(-1).abs() for one in same]).amax(0)
     differences = {
-        "meters": found.means - expected.means,
-        "radians": 2 * torch.arccos(cosines.clamp(max=1)),
-        "log_scale": found.scales.log() - expected.scales.log(),
-        "opacity": found.opacities - expected.opacities,
-        "color": found.sh[:, 0] - expected.sh[:, 0],
-        "higher": found.sh[:, 1:] - expected.sh[:, 1:],
-    }
+        "meters": found.means - expected.means, "radians": 2 * torch.arccos(cosines.clamp(max=1)),
+        "log_scale": found.scales.log() - expected.scales.log(), "opacity": found.opacities - expected.opacities,
+        "color": found.sh[:, 0] - expected.sh[:, 0], "higher": found.sh[:, 1:] - expected.sh[:, 1:],
+    }  # fmt: skip
     for name, difference in differences.items():
         most = float(difference.abs().max()) if difference.numel() else 0.0
         assert most <= getattr(loss, name) + 1e-6, f"{name}: {most:.3g}"
@@ -124,7 +120,7 @@ QUATS_IN_SPZ = {
 three in that order, a sign and 9 bits of size each, in steps of sqrt(1/2) / 511. 0.6 is 434 steps."""
 
 
-def test_quaternions_lie_in_spz_in_the_order_of_its_specification(tmp_path: Path) -> None:
+def test_quaternions_lie_in_spz_as_its_specification_says(tmp_path: Path) -> None:
     """Writer and reader could swap components alike, which no round trip would see."""
     quats = torch.tensor(list(QUATS_IN_SPZ))
     write_spz(tmp_path / "a.spz", replace(some(len(quats), 1), quats=quats), version=3)
@@ -153,12 +149,18 @@ def test_another_program_opens_them(tmp_path: Path, ending: str, coefficients: i
 
 def test_far_positions_in_spz_are_coarser(tmp_path: Path) -> None:
     """Positions beyond 128 m take bits from behind the point; what no bits can hold is refused."""
-    near = some(10, 1)
-    far = replace(near, means=near.means + 1000)
-    write_spz(tmp_path / "a.spz", far)
-    expect_near(read_spz(tmp_path / "a.spz"), far, replace(SPZ_LOSS, meters=2**-13))
-    with pytest.raises(UserError, match=r"a\.spz: a Gaussian is 1e\+09 m away, too far for \.spz"):
-        write_spz(tmp_path / "a.spz", replace(near, means=near.means + 1e9))
+    near, path = some(10, 1), tmp_path / "a.spz"
+    for away, step in ((0, 2**-16), (100, 2**-16), (-100, 2**-16), (150, 2**-15), (1000, 2**-13), (-1000, 2**-13)):
+        far = replace(near, means=near.means + away)
+        write_spz(path, far)
+        expect_near(read_spz(path), far, replace(SPZ_LOSS, meters=step / 2))
+    for edge in (128 - 2**-16, 128 - 2**-17, 128, 2**23 - 1):  # the largest number of 24 bits, and beside it
+        far = replace(near, means=torch.tensor([[edge, -edge, 0.0]]).repeat(10, 1))
+        write_spz(path, far)
+        torch.testing.assert_close(read_spz(path).means, far.means, rtol=0, atol=2**-16)
+    for away in (1e9, -1e9):
+        with pytest.raises(UserError, match=r"a\.spz: a Gaussian is 1e\+09 m away, too far for \.spz"):
+            write_spz(path, replace(near, means=near.means + away))
 
 
 def test_similar_gaussians_share_coefficients() -> None:
@@ -180,8 +182,7 @@ def test_usd_keeps_poses_and_follows_its_schema(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "b.usda").write_text("solid cube")
     for name in ("a.usda", "b.usda", "gone.usda"):
-        with pytest.raises(UserError, match=f"{name}: is missing, damaged, or has no Gaussians"):
-            read_usd(tmp_path / name)
+        refuses(f"{name}: is missing, damaged, or has no Gaussians", read_usd, tmp_path / name)
     Usd, UsdGeom, UsdValidation, UsdVol = (
         importlib.import_module(f"pxr.{n}") for n in ("Usd", "UsdGeom", "UsdValidation", "UsdVol")
     )
@@ -207,8 +208,7 @@ def test_usd_keeps_poses_and_follows_its_schema(tmp_path: Path) -> None:
         assert ((low <= poses[1].means.numpy()) & (poses[1].means.numpy() <= high)).all()
         for time, pose in enumerate(poses):
             expect_near(read_usd(path, float(time)), pose, Loss())
-    with pytest.raises(UserError, match="has no Gaussians at time None"):
-        read_usd(tmp_path / "s.usda")
+    refuses("has no Gaussians at time None", read_usd, tmp_path / "s.usda")
 
 
 @needs_usd
@@ -216,22 +216,19 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     bad = some(5, 1)
     bad.means[3, 1] = math.nan
     for ending in (".ply", ".spz", ".sog", ".usda"):
-        with pytest.raises(UserError, match="1 of 5 Gaussians are NaN or infinite"):
-            WRITERS[ending](tmp_path / f"a{ending}", bad)
+        refuses("1 of 5 Gaussians are NaN or infinite", WRITERS[ending], tmp_path / f"a{ending}", bad)
     assert list(tmp_path.iterdir()) == []
 
 
 def expect_refused(path: Path, read: Callable[[Path], Gaussians], *cases: tuple[bytes, str]) -> None:
     for damaged, reason in cases:
         path.write_bytes(damaged)
-        with pytest.raises(UserError, match=reason):
-            read(path)
+        refuses(reason, read, path)
 
 
 def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     path, cannot, many = tmp_path / "a.spz", r"a\.spz: cannot be read as \.spz", (2**31).to_bytes(4, "little")
-    with pytest.raises(UserError, match="No such file"):
-        read_spz(path)
+    refuses("No such file", read_spz, path)
     write_spz(path, some(50, 4), version=3)
     content = path.read_bytes()
     plain = gzip.decompress(content)

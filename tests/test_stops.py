@@ -1,4 +1,4 @@
-"""Signals stop work in an orderly way, also if a library drops them, and nothing is left half-written."""
+"""Signals and kills stop work in an orderly way: nothing is half-written, and commands continue to the same bytes."""
 
 import contextlib
 import importlib
@@ -6,10 +6,11 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,15 @@ import cv2
 import pytest
 
 from forked import Forked, ForkServer
+from fuzzing.kills import SIGNALS, differing_files, hidden_files
 from mien.cli import main
 from mien.evaluation.partial import PartialScores
 from mien.machine import stops
 from mien.machine.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Terminated, orderly_stops, stops_put_off
 from mien.media.video import read_video_frames
 from mien.pipeline import draw as pictures
-from toy_workspace import write_toy_workspace
+from shared_things import write_toy_workspace
+from two_commands import RANK, Studio, run, toy_studio
 
 KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated, signal.SIGHUP: HungUp}
 of_every_kind = pytest.mark.parametrize("number", KINDS)
@@ -49,8 +52,7 @@ def test_a_second_signal_does_not_interrupt_the_removal(number: signal.Signals) 
             removed.append("half a file")
 
     orderly(number, work)
-    assert removed == ["half a file"]
-    assert [signal.getsignal(each) for each in KINDS] == before
+    assert (removed, [signal.getsignal(each) for each in KINDS]) == (["half a file"], before)
 
 
 @of_every_kind
@@ -195,15 +197,10 @@ def content(path: Path) -> list[bytes]:
 @pytest.mark.unchecked
 @pytest.mark.usefixtures("short_films")
 @pytest.mark.parametrize(("name", "how"), [
-    ("a.mp4", signal.SIGKILL),
-    ("a.webm", signal.SIGINT),
-    ("a.png", signal.SIGINT),
-    ("a_%06d.png", signal.SIGTERM),
+    ("a.mp4", signal.SIGKILL), ("a.webm", signal.SIGINT), ("a.png", signal.SIGINT), ("a_%06d.png", signal.SIGTERM),
     ("pictures", signal.SIGKILL),
 ])  # fmt: skip
-def test_stopped_rendering_ends_alike_the_next_time(
-    name: str, how: signal.Signals, fork_server: ForkServer, workspace: Path, tmp_path: Path
-) -> None:
+def test_stopped_rendering_ends_alike_the_next_time(name: str, how: signal.Signals, fork_server, workspace, tmp_path):
     """A stopped rendering leaves the old file until the new one is whole. Every numbered picture is whole."""
     command = ["render", str(workspace), *LOOK, "--out"]
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
@@ -220,8 +217,7 @@ def test_stopped_rendering_ends_alike_the_next_time(
         assert len(visible(folder)) == 2
         assert all(cv2.imread(str(folder / each)) is not None for each in visible(folder))
     else:
-        assert visible(folder) == [name]
-        assert (out / name).read_text() == "mine"
+        assert (visible(folder), (out / name).read_text()) == ([name], "mine")
     assert how == signal.SIGKILL or len(visible(folder)) == len(list(folder.iterdir())), "something half-written stays"
     assert main([*command, str(out / name)]) == 0
     files = [path for path in undisturbed.rglob("*") if path.is_file()]
@@ -273,3 +269,67 @@ def test_figures_stay_whole_where_the_report_is_interrupted(evaluated: Path, tmp
         assert (run / "metrics.json").read_bytes() == before
     assert main(["evaluate", str(folder), *EVALUATE]) == 0
     assert [path.name for path in run.rglob(".*")] == []
+
+
+STAGES = {
+    "capture": ("capture {pictures} --out {box}/new --name clip", signal.SIGKILL, 2),
+    "train": ("train {box} --run new --steps 6 --split tail --training.checkpoint-every 2", signal.SIGTERM, 3),
+    "evaluate": ("evaluate {box} --run alone --no-perceptual", signal.SIGINT, 1),
+    "export": ("export {box} --run alone --out {box}/me.mien", signal.SIGKILL, 1),
+}
+"""Name of a stage -> its command, a signal, and before which of its files it comes."""
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    folder = tmp_path_factory.mktemp("kills")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("MIEN_CACHE", str(folder / "cache"))
+        made = toy_studio(folder / "studio", folder / "cache")
+        assert main(["train", str(made.root), "--run", "alone", "--steps", "3", "--split", "tail", *RANK]) == 0
+        yield made
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_command_that_is_stopped_before_it_puts_a_file_in_place_goes_on(
+    stage: str, studio: Studio, fork_server: ForkServer, tmp_path: Path
+) -> None:
+    line, number, file = STAGES[stage]
+    box, whole = tmp_path / "box", tmp_path / "whole"
+    words = [word.format(box=box, pictures=studio.video) for word in line.split()]
+    words += studio.capture_options if stage == "capture" else RANK if stage == "train" else []
+    shutil.copytree(studio.root, box)
+    assert fork_server.call("two_commands:run", words, exits=True).wait() == 0
+    box.rename(whole)
+    shutil.copytree(studio.root, box)
+    stopped = fork_server.call("test_stops:run_until_a_file", words, int(number), file, exits=True)
+    assert stopped.wait() == SIGNALS[number]
+    assert differing_files(whole, box) != [], "the command was not stopped"
+    assert fork_server.call("two_commands:run", words, exits=True).wait() == 0
+    assert differing_files(whole, box) == []
+    assert number == signal.SIGKILL or not hidden_files(box)
+
+
+def run_until_a_file(words: list[str], number: int, file: int) -> int:
+    """Run a command in this process, which must be a fork, and send it a signal before it puts a file in place."""
+    replace, count = Path.replace, 0
+
+    def counted(self: Path, target: str | os.PathLike[str]) -> Path:
+        nonlocal count
+        count += 1
+        if count == file:
+            os.kill(os.getpid(), number)
+        return replace(self, target)
+
+    Path.replace = counted
+    return run(words)
+
+
+@pytest.mark.long
+def test_random_kills_leave_nothing_to_do_by_hand(tmp_path: Path) -> None:
+    seed, findings = os.environ.get("MIEN_SEED", "0"), tmp_path / "kills.jsonl"
+    words = ["-m", "fuzzing.kills", "--kills", "12", "--seed", seed, "--findings", str(findings)]
+    result = subprocess.run([sys.executable, *words], cwd=Path(__file__).parent, capture_output=True, text=True)
+    assert result.returncode == 0, f"seed {seed}:\n{result.stdout}\n{result.stderr[-3000:]}\n{findings.read_text()}"
+    assert " kills; " in result.stdout

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import train_toy
+from known import known
 from mien.avatar.methods import METHODS
 from mien.cli import main
-from mien.errors import UserError
 from mien.lab.analysis.study.clips import spans
 from mien.lab.analysis.study.drawing import encode
 from mien.lab.analysis.study.files import QUESTIONS, read_all_answers, read_key
@@ -23,8 +23,9 @@ from mien.lab.analysis.study.settings import StudySettings
 from mien.lab.analysis.study.shuffling import shuffled
 from mien.media.video import read_video_frames
 from mien.training import read_sequence, train
+from refusals import refuses
+from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
-from toy_workspace import write_toy_workspace
 from web_case import browse, expect_usable, picture
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
@@ -57,8 +58,7 @@ def page(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def content_of(page: Path) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="study">(.*?)</script>', page.read_text())
-    assert found is not None
+    found = known(re.search(r'<script type="application/json" id="study">(.*?)</script>', page.read_text()))
     return json.loads(found[1])
 
 
@@ -122,8 +122,7 @@ def frames_of(page: Path, clip: str, folder: Path) -> np.ndarray:
 
 def head_square(path: Path) -> np.ndarray:
     """Return the square around the toy's head box, with its margin of 1 pixel, as the study scales it."""
-    picture = cv2.imread(str(path))
-    assert picture is not None
+    picture = known(cv2.imread(str(path)))
     cut = picture[3:25, 3:25, ::-1]
     return cv2.resize(np.ascontiguousarray(cut), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC).astype(np.float64)
 
@@ -137,8 +136,7 @@ def test_the_budget_is_kept(workspace: Path, tmp_path: Path, capsys: pytest.Capt
     best, small = encode(noise, 25.0, 1 << 20, "it"), encode(noise, 25.0, 30_000, "it")
     assert best.crf < small.crf
     assert len(small.data) <= 30_000
-    with pytest.raises(UserError, match="it: does not fit into the page even at the lowest quality"):
-        encode(noise, 25.0, 1_000, "it")
+    refuses("it: does not fit into the page even at the lowest quality", encode, noise, 25.0, 1_000, "it")
 
 
 def test_spans_are_cut_into_equal_parts_and_ordered_by_chance() -> None:
@@ -210,12 +208,10 @@ def test_bad_answers_are_told_in_one_line(page: Path, tmp_path: Path, capsys: py
         refused(capsys, told, "tally", key, tmp_path / "good.json", bad)
     bad.write_text(json.dumps(good))
     for key_file, answers, told in (
-        (key, tmp_path, "is of participant 00000001"),
-        (key, gone, "gone.json: no such file"),
-        (gone, tmp_path, "gone.json: missing"),
-        (tmp_path / "good.json", tmp_path, "expected 'mien.study_key'"),
+        (key, tmp_path, "is of participant 00000001"), (key, gone, "gone.json: no such file"),
+        (gone, tmp_path, "gone.json: missing"), (tmp_path / "good.json", tmp_path, "expected 'mien.study_key'"),
         (key, page.parent, "has no answer file"),
-    ):
+    ):  # fmt: skip
         refused(capsys, told, "tally", key_file, answers)
 
 
@@ -264,7 +260,7 @@ SAVE = """(async () => {
 })()"""
 
 
-def test_a_participant_answers_in_a_browser(page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_participant_answers_in_a_browser_under_a_name_of_their_own(page: Path, tmp_path: Path, capsys) -> None:
     key = read_key(page.with_name("study.key.json"))
     toy, begun = (
         [tile for clip in key.clips for tile in clip.tiles if clip.tiles[tile] == run] for run in ("toy", "begun")
@@ -293,9 +289,6 @@ def test_a_participant_answers_in_a_browser(page: Path, tmp_path: Path, capsys: 
     assert main(["study", "tally", str(page.with_name("study.key.json")), str(saved), "--json"]) == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
     assert (runs["toy"]["quality"]["percent"], runs["begun"]["expression"]["percent"]) == (100, 100)
-
-
-def test_everybody_can_take_part_under_a_name_of_their_own(page: Path) -> None:
     expect_usable(page, "", f"{START};")
     name = 'document.getElementById("participant").textContent'
     first, other = (browse(page, [START, name])["results"][1] for _ in range(2))

@@ -11,7 +11,6 @@ import torch
 
 from exact_guard import exact_guard
 from mien.capture import read_capture
-from mien.errors import UserError
 from mien.lab.synthetic import RECIPES, synthesize
 from mien.lab.synthetic.captures import Pictures, inputs_hash, write_synthetic_capture
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
@@ -22,6 +21,7 @@ from mien.lab.synthetic.truth import read_truth
 from mien.machine import exact
 from mien.render.mesh import vertex_normals
 from reference_signatures import drawn_signatures, signature_distance, stored_signatures
+from refusals import refuses
 
 SMALL = replace(RECIPES["demo"], width=192, height=192, seconds=0.6, fps=10.0, texture_size=256, noise=0.0)
 
@@ -49,8 +49,7 @@ def test_capture_and_truth_keep_their_contracts_and_recipe_and_seed_decide_every
     """Frames come in order for any number of threads, and one that is drawn again is the same."""
     monkeypatch.setenv("MIEN_THREADS", "2")
     capture, truth = synthesize(replace(SMALL), seed=3)
-    assert capture.images.shape == (6, 1, 192, 192, 3)
-    assert capture.landmarks.shape == (6, 1, 478, 2)
+    assert (capture.images.shape, capture.landmarks.shape) == ((6, 1, 192, 192, 3), (6, 1, 478, 2))
     assert capture.valid.all()
     assert (len(truth.face), len(truth.valid), truth.neck_lines.shape) == (6, 6, (6, 1, 3))
     assert truth.face_model_hash == scene.model.content_hash
@@ -76,8 +75,7 @@ KEYS = {
 }  # fmt: skip
 """Keys of the references. A change means that figures on the capture cannot be compared any more.
 
-Then say so in docs/results.md, and set the new key. A change of the drawing raises `DRAWING`, and with it all keys.
-"""
+Then say so in docs/results.md, and set the new key. A change of the drawing raises `DRAWING`, and with it all keys."""
 TINY = replace(
     RECIPES["demo"], width=64, height=64, fps=4.0, texture_size=128, supersample=1, hair="none", glasses=False,
     brows_and_lashes=False, script=(Segment("free", 1.0), Segment("still", 1.0)),
@@ -88,8 +86,7 @@ RING = replace(TINY, cameras="ring", ring_size=3, width=128, height=128)
 @pytest.mark.exact
 def test_key_of_each_reference_is_fixed():
     assert {name: reference.key() for name, reference in REFERENCES.items()} == KEYS
-    with pytest.raises(UserError, match="choose one of: mono-short, mono-long, ring-16"):
-        reference_named("mono")
+    refuses("choose one of: mono-short, mono-long, ring-16", reference_named, "mono")
 
 
 @pytest.mark.unchecked
@@ -112,7 +109,7 @@ def ring(tmp_path_factory):
     return folder
 
 
-def test_ring_is_a_calibrated_capture_with_its_truth(ring):
+def test_a_ring_is_a_calibrated_capture_whose_truth_is_what_the_face_model_says(ring):
     capture, truth = read_capture(ring / "capture"), read_truth(ring / "truth")
     assert capture.images.shape == (8, 3, 128, 128, 3)
     assert capture.calibration is not None
@@ -128,17 +125,12 @@ def test_ring_is_a_calibrated_capture_with_its_truth(ring):
     found = capture.valid[:, 0]
     assert found.sum() >= 4
     assert np.median(np.linalg.norm(capture.landmarks[found, 0] - truth.landmarks[found, 0], axis=-1)) < 3
-
-
-def test_truth_is_what_the_face_model_says(ring):
-    truth, scene = read_truth(ring / "truth"), SyntheticScene(RING, 3)
     expected = scene.model(truth.tracking.face[5])[0][torch.from_numpy(truth.vertex_index)]
     np.testing.assert_allclose(truth.vertices_world[5], expected.numpy(), atol=2e-5)
     np.testing.assert_allclose(truth.landmarks[5, 2], scene.landmarks(2)[5], atol=0.04)
     for path in (ring / "truth").glob("truth.*"):
         os.truncate(path, path.stat().st_size - 1)
-    with pytest.raises(UserError, match="damaged"):
-        read_truth(ring / "truth")
+    refuses("damaged", read_truth, ring / "truth")
 
 
 @pytest.mark.unchecked

@@ -13,15 +13,14 @@ from mien.avatar.schedules import Progress
 from mien.avatar.textured_mesh.avatar import TexturedMesh
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
-from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.mirror import triangle_geometry
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_textured_mesh
-from sh_colors import rgb_from_sh
-from toy_scene import toy_camera, toy_face, toy_face_model
+from refusals import refuses
+from toy_scene import rgb_from_sh, toy_camera, toy_face, toy_face_model
 
 PLAIN = plain_textured_mesh()
 
@@ -68,13 +67,25 @@ def plane_model(cells: int = 5) -> FaceModel:
     )  # fmt: skip
 
 
-def test_surfels_cover_equal_areas() -> None:
+def test_surfels_cover_equal_areas_and_follow_offsets_exactly() -> None:
     model = plane_model()
     bound = place_surfels(model.template, model.faces, 3000)
     assert len(bound) == pytest.approx(3000, rel=0.05)
     own = triangle_geometry(model.template, model.faces)[1] / torch.bincount(bound)
     assert own.max() / own.min() < 1.4
     assert torch.bincount(place_surfels(model.template, model.faces, 1)).tolist() == [1] * len(model.faces)
+    avatar = new_avatar(disturbed=1.0)
+    model, face, bound = avatar.face_model, at_rest(avatar), avatar.store["face_index"]
+    posed = avatar.pose(face)
+    corners = (model.rest_vertices(face) + posed.aux["offsets"])[model.faces]
+    surfels = Surfels(bound, len(model.faces), model.template)
+    torch.testing.assert_close(posed.gaussians.means[0], surfels.at_corners(corners), atol=1e-6, rtol=0)
+    # A surfel's covariance is that of its part of the triangle, twice and a half as wide along each axis.
+    parts = (corners - corners.mean(1, keepdim=True))[bound] * surfels.shares()[:, None, None]
+    expected = PLAIN.overlap**2 * parts.transpose(1, 2) @ parts / 12
+    turns, scales = matrix_from_quaternion(posed.gaussians.quats[0]), posed.gaussians.scales[0]
+    found = turns @ torch.diag_embed((scales * torch.tensor([1, 0, 1])) ** 2) @ turns.transpose(1, 2)
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
 
 
 def picture(avatar: TexturedMesh) -> tuple[Tensor, Tensor]:
@@ -108,22 +119,7 @@ def test_surfels_cover_the_mesh(surfels: int, least: float) -> None:
     assert narrow[inside].min() < 0.9
 
 
-def test_surfels_follow_offsets_exactly() -> None:
-    avatar = new_avatar(disturbed=1.0)
-    model, face, bound = avatar.face_model, at_rest(avatar), avatar.store["face_index"]
-    posed = avatar.pose(face)
-    corners = (model.rest_vertices(face) + posed.aux["offsets"])[model.faces]
-    surfels = Surfels(bound, len(model.faces), model.template)
-    torch.testing.assert_close(posed.gaussians.means[0], surfels.at_corners(corners), atol=1e-6, rtol=0)
-    # A surfel's covariance is that of its part of the triangle, twice and a half as wide along each axis.
-    parts = (corners - corners.mean(1, keepdim=True))[bound] * surfels.shares()[:, None, None]
-    expected = PLAIN.overlap**2 * parts.transpose(1, 2) @ parts / 12
-    turns, scales = matrix_from_quaternion(posed.gaussians.quats[0]), posed.gaussians.scales[0]
-    found = turns @ torch.diag_embed((scales * torch.tensor([1, 0, 1])) ** 2) @ turns.transpose(1, 2)
-    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
-
-
-def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
+def test_teeth_and_eyes_stay_and_offsets_and_colours_are_averaged_over_neighbours() -> None:
     model = toy_face_model()
     v = len(model.template)
     matrix = torch.zeros(v, v, dtype=torch.float64)
@@ -134,9 +130,6 @@ def test_offsets_and_colours_are_averaged_over_neighbours() -> None:
     smooth = torch.linalg.matrix_power((torch.eye(v) + matrix.float()) / 2, 3)
     offsets = avatar.get_buffer("movable") * (smooth @ avatar.vertex_means)
     torch.testing.assert_close(avatar.averaged(), (offsets, smooth @ avatar.vertex_albedo))
-
-
-def test_teeth_and_eyes_stay_where_they_are() -> None:
     model = toy_face_model()
     regions = torch.zeros(len(model.faces), dtype=torch.long)
     regions[:20], regions[20:25], regions[-20:] = 1, 2, 3
@@ -148,7 +141,7 @@ def test_teeth_and_eyes_stay_where_they_are() -> None:
     assert torch.equal((offsets != 0).any(1), outer)
 
 
-def test_a_color_is_albedo_times_light_on_the_normal() -> None:
+def test_a_color_is_albedo_times_light_on_the_normal_in_the_frame_of_the_light() -> None:
     avatar = new_avatar(model=plane_model())
     torch.testing.assert_close(colors(avatar, at_rest(avatar)), torch.full((len(avatar.store), 3), 0.5))
     with torch.no_grad():
@@ -167,9 +160,6 @@ def test_a_color_is_albedo_times_light_on_the_normal() -> None:
     x, z = 0.6 * edges[:, 0] / edges.norm(dim=1), 0.8
     expected = torch.stack([0.25 * (1 + z + 0 * x), 0.5 * (1 + x), 0.75 * (3 * z**2 - 1) + 0 * x], dim=-1)
     torch.testing.assert_close(colors(avatar, at_rest(avatar)), expected)
-
-
-def test_light_in_the_world_stays_as_the_head_turns() -> None:
     turn = torch.tensor([[0.0, math.pi / 2, 0.0]])
     for light in ("head", "world"):
         avatar = new_avatar(replace(PLAIN, light=light), plane_model())
@@ -188,8 +178,7 @@ def test_light_in_the_world_stays_as_the_head_turns() -> None:
             continue
         # The sheet looks along +x now, where the first channel has no lamp and the second has one.
         torch.testing.assert_close(after[..., [1, 0]], before[..., [0, 1]], atol=1e-5, rtol=0)
-        with pytest.raises(UserError, match=r"^the setting light world of textured_mesh: .*export a \.ply"):
-            avatar.bake()
+        refuses(r"^the setting light world of textured_mesh: .*export a \.ply", avatar.bake)
 
 
 @pytest.mark.parametrize("light", ["head", "world"])

@@ -8,7 +8,15 @@ import torch
 from mien.tracking.fitting.fit import Fit, SequenceFit, Subject, smoothness_of
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.shot import shot_of
-from mien.tracking.fitting.solver import Bounds, NormalEquations, Smoothness, minimize_frames, solve_chain
+from mien.tracking.fitting.solver import (
+    Bounds,
+    NormalEquations,
+    SharedEquations,
+    Smoothness,
+    minimize_frames,
+    solve_arrow,
+    solve_chain,
+)
 from mien.tracking.fitting.views import batch_of
 from mien.tracking.landmarks import groups
 from mien.tracking.landmarks.model import reduce_face_model
@@ -107,7 +115,6 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     held = torch.zeros(timesteps, p, dtype=torch.bool)
     held[1, 2] = True
     step = solve_chain(NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
-
     weights, second = smoothness.weights(state), torch.zeros(timesteps, timesteps, dtype=torch.float64)
     for t in range(1, timesteps - 1):
         second[t, t - 1 : t + 2] = torch.tensor([1.0, -2.0, 1.0])
@@ -121,6 +128,22 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     state.requires_grad_()
     smoothness.cost(state).backward()
     torch.testing.assert_close(2 * smoothness.gradient(state.detach()), state.grad)
+
+
+def test_frames_and_what_they_share_are_solved_as_one_dense_system():
+    random, damping = torch.Generator().manual_seed(0), 0.1
+    root = torch.randn(8, 8, generator=random, dtype=torch.float64)  # two frames of three parameters, and two shared
+    dense, gradient = root @ root.T + torch.eye(8), torch.randn(8, generator=random, dtype=torch.float64)
+    dense[:3, 3:6] = dense[3:6, :3] = 0
+    own = torch.stack([dense[:3, :3], dense[3:6, 3:6]])
+    frames = NormalEquations(torch.zeros(2), gradient[:6].reshape(2, 3), own)
+    shared = SharedEquations(dense[:6, 6:].reshape(2, 3, 2), dense[6:, 6:], gradient[6:])
+    held = torch.tensor([[False, False, True], [False, False, False]])
+    steps = solve_arrow(frames, shared, held, damping)
+    moving, expected = torch.cat([~held.flatten(), torch.ones(2, dtype=torch.bool)]), torch.zeros(8).double()
+    damped = dense + torch.diag(damping * dense.diagonal())
+    expected[moving] = -torch.linalg.solve(damped[moving][:, moving], gradient[moving])
+    torch.testing.assert_close(torch.cat([step.flatten() for step in steps]), expected)
 
 
 def test_landmark_groups_are_mediapipes():
@@ -172,9 +195,6 @@ def test_priors_weigh_as_much_in_the_cost_as_in_the_equations(case):
     torch.testing.assert_close(equations.cost, wanted)
     torch.testing.assert_close(equations.gradient, own.state @ precision)
     torch.testing.assert_close(equations.hessian, precision.expand_as(equations.hessian))
-
-
-def test_shared_parameters_have_one_prior_in_the_cost_and_in_the_equations(case):
     term, own, subject = case
     fit = Fit(subject, (own,))
     precision = precision_of_shared(fit, [0], TrackingSettings())

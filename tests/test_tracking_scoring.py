@@ -27,6 +27,7 @@ from mien.tracking.scoring_files import (
 )
 from mien.tracking.settings import ScoringSettings
 from mien.tracking.tracking import Appearance, Tracking
+from refusals import refuses
 from small_face_model import make_small_face_model
 from tracking_case import SIZE, capture_of, still_camera
 
@@ -120,8 +121,7 @@ def test_bowed_chin_stays_and_slivers_go():
     matte[:, 30:40] = 0
     mask = cut_matte(matte, head, keep)
     assert mask[55, 60] == 255, "the chin below the line"
-    assert mask[55, 80] == 0
-    assert mask[30, 80] == 255
+    assert (mask[55, 80], mask[30, 80]) == (0, 255)
     assert mask[30, 10] == 0, "a part that the matte does not join to the head"
     assert (cut_matte(0 * matte + 90, head, 0 * keep + 1) == 90).all(), "opacity is kept"
     mask = np.zeros((50, 60), np.uint8)
@@ -131,7 +131,7 @@ def test_bowed_chin_stays_and_slivers_go():
     assert head_crop(0 * mask).tolist() == [0, 0, 60, 50]
 
 
-def test_make_scoring():
+def test_scoring_keeps_what_is_above_the_line_of_each_picture_and_nothing_else():
     model, face = _upright(2)
     scoring = make_scoring(capture_of(torch.full((2, 478, 2), 100.0)), _tracking(model, face), model)
     assert (scoring.masks.shape, scoring.cut) == ((2, 1, SIZE, SIZE), "plane")
@@ -141,10 +141,7 @@ def test_make_scoring():
     left, top, width, height = scoring.crops[0, 0]
     assert (left, top, width) == (0, 0, SIZE)
     assert abs(height - row) < 15
-
-
-def test_the_cut_line_keeps_what_is_above_the_line_of_each_picture_and_nothing_else():
-    """`line` is the supplement's mask: a straight line in the picture, and no exception for what is below it."""
+    # `line` is the supplement's mask: a straight line in the picture, and no exception for what is below it.
     model, face = _upright(2, roll=0.5)
     tracking, capture = _tracking(model, face), capture_of(torch.full((2, 478, 2), 100.0))
     scoring = make_scoring(capture, tracking, model, settings=ScoringSettings("line"))
@@ -229,8 +226,7 @@ def test_wrong_content(tmp_path, change, message):
     write_tensors(file, tensors)
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     edit_json(tmp_path / "tracking.json", lambda content: content.update(tensors_sha256=digest))
-    with pytest.raises(UserError, match=message):
-        read_tracking(tmp_path)
+    refuses(message, read_tracking, tmp_path)
 
 
 def _scoring(value: int = 200) -> Scoring:
@@ -268,8 +264,7 @@ def test_masks_keep_their_cut(tmp_path):
     with pytest.raises(UserError, match=r"--scoring.cut plane: .*give --scoring.cut line, or delete that folder"):
         check_scoring_cut(folder, ScoringSettings("plane"), "a1")
     edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
-    with pytest.raises(UserError, match=r"cut 'circle' is neither plane nor line; delete the folder"):
-        read_scoring(folder)
+    refuses(r"cut 'circle' is neither plane nor line; delete the folder", read_scoring, folder)
     edit_json(folder / "scoring.json", lambda content: content.pop("cut"))
     assert read_scoring(folder).cut == "plane", "masks from before there was a choice"
 
@@ -285,6 +280,5 @@ def test_damaged_scoring(tmp_path):
         mask.unlink()
         if content:
             mask.write_bytes(content)
-        with pytest.raises(UserError, match=refusal):
-            read_scoring(tmp_path / "s")
+        refuses(refusal, read_scoring, tmp_path / "s")
         mask.touch()

@@ -14,7 +14,6 @@ from mien.adam import Moments
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import PerceptualLoss, Photometric
-from mien.errors import UserError
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, train, trainer
@@ -24,6 +23,7 @@ from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.trainer import passed, start, step
 from plain_settings import plain_mono_gaussian_avatar, plain_run
+from refusals import refuses
 from test_methods import new_avatar
 from toy_scene import toy_camera, toy_face, toy_sequence
 
@@ -111,8 +111,7 @@ def test_many_points_mean_fewer_frames() -> None:
         store.select(torch.arange(count) % len(store))
         found.append(state.avatar.extras.frames_per_step())
     assert found == [8, 8, 7, 3, 2, 1, 1, 1]
-    with pytest.raises(UserError, match="frames-per-step 0"):
-        replace(SMALL, frames_per_step=0).check()
+    refuses("frames-per-step 0", replace(SMALL, frames_per_step=0).check)
     assert [new_avatar(method).extras.frames_per_step() for method in ("gaussian_avatars", "headgas")] == [1, 1]
 
 

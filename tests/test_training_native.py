@@ -1,7 +1,5 @@
 """The native parts of posing and of training steps agree with their plain PyTorch twins, on every instruction set.
-
-A table has them all. tests/test_feature_network.py, tests/test_point_network.py and others hold what is special.
-"""
+A table has them all. tests/test_feature_network.py, tests/test_point_network.py and others hold what is special."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ import test_point_network as points
 from instruction_sets import by_threads
 from mien import _native
 from mien.adam import FactoredMoments
+from mien.avatar.avatar import ParameterGroup
 from mien.avatar.gaussian_avatars.settings import SurfaceLimits
 from mien.avatar.gaussian_avatars.surface_limits import (
     keep_on_surface,
@@ -29,8 +28,10 @@ from mien.avatar.ops.expression_changes import expression_change, expression_cha
 from mien.avatar.ops.skin_points import skin_points, skin_points_reference
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
+from mien.avatar.schedules import Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
 from mien.training.adam import (
+    Adam,
     FactoredAdamUpdate,
     FactoredUpdate,
     Update,
@@ -191,9 +192,7 @@ def skinned(given: Tensors, native: bool) -> Tensors:
 
 def bound_inputs(size: tuple[tuple[int, ...], int]) -> Tensors:
     """Vertices at timesteps, faces, and the face, mean, quaternion and scales of Gaussians.
-
-    They are turned in every way, so that each of the four quaternion formulas is used; quaternions have any length.
-    """
+    They are turned in every way, so that each of the four quaternion formulas is used; quaternions have any length."""
     timesteps, count = size
     faces = torch.stack([torch.randperm(20, generator=torch.Generator().manual_seed(i))[:3] for i in range(30)])
     index = torch.randint(0, 30, (count,), generator=torch.Generator().manual_seed(1))
@@ -329,6 +328,10 @@ def test_adam_takes_another_epsilon_and_what_is_not_dense_by_the_reference() -> 
         values = torch.zeros(4, 3)
         update_all([Update(values, torch.full((1, 3), 1e-9).expand(4, 3), Moments.zeros(values), 0.1, epsilon)])
         torch.testing.assert_close(values, torch.full((4, 3), -moved), rtol=1e-4, atol=0)
+        of_a_group = torch.zeros(4, 3, requires_grad=True)
+        of_a_group.grad = torch.full((4, 3), 1e-9)
+        Adam().step([ParameterGroup("one", {"one": of_a_group}, Rate(0.1), epsilon=epsilon)], Progress(0, 1))
+        torch.testing.assert_close(of_a_group.detach(), values, rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])

@@ -16,7 +16,6 @@ from mien.avatar.avatar import ParameterGroup, store_group
 from mien.avatar.schedules import Progress, Rate
 from mien.avatar.settings import Photometric
 from mien.avatar.store import GaussianStore, Moments
-from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.training import train
 from mien.training.adam import Adam
@@ -35,28 +34,25 @@ from mien.training.photometric import photometric_loss
 from mien.training.settings import Split
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
-from sh_colors import rgb_from_sh
-from toy_scene import toy_sequence
+from refusals import refuses
+from toy_scene import rgb_from_sh, toy_sequence
 from train_toy import stopped_at
 
 
-@pytest.mark.parametrize(
-    ("timesteps", "split", "expected"),
-    [
-        (120, "blocks", [*range(40, 50), *range(90, 100)]),  # every fifth block of ten
-        (5, "blocks", [4]),
-        (30, "blocks", [*range(24, 30)]),
-        (49, "blocks", [*range(36, 45)]),
-        (101, "tail", [*range(81, 101)]),
-        (104, "tail", [*range(83, 104)]),  # 20.8 timesteps are rounded, not cut
-        (101, "none", []),
-    ],
-)
+@pytest.mark.parametrize(("timesteps", "split", "expected"), [
+    (120, "blocks", [*range(40, 50), *range(90, 100)]),  # every fifth block of ten
+    (5, "blocks", [4]),
+    (30, "blocks", [*range(24, 30)]),
+    (49, "blocks", [*range(36, 45)]),
+    (101, "tail", [*range(81, 101)]),
+    (104, "tail", [*range(83, 104)]),  # 20.8 timesteps are rounded, not cut
+    (101, "none", []),
+])  # fmt: skip
 def test_splits(timesteps: int, split: Split, expected: list[int]) -> None:
     assert held_out(timesteps, split).nonzero()[:, 0].tolist() == expected
 
 
-def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
+def test_frames_leave_out_what_is_invalid_or_held_out_which_has_to_be_there() -> None:
     _, sequence = toy_sequence(60, 16)
     valid = np.ones((60, 1), dtype=bool)
     valid[3] = False
@@ -66,9 +62,6 @@ def test_frames_leave_out_what_is_invalid_or_held_out() -> None:
     assert {frame.timestep for frame in frames if frame.sequence == 1} == set(range(60)) - {3} - set(range(40, 50))
     only = training_frames([sequence, second], plain_run(split="none", held_out_sequences=("toy",)))
     assert {frame.sequence for frame in only} == {1}
-
-
-def test_what_is_held_out_has_to_be_there() -> None:
     _, sequence = toy_sequence(12, 16)
     for settings, words in (
         (plain_run(held_out_sequences=("tyo",)), "--hold-out tyo: no such sequence in this run; there are: toy"),
@@ -76,8 +69,7 @@ def test_what_is_held_out_has_to_be_there() -> None:
         (plain_run(held_out_sequences=("toy",)), "leaves no sequence to train on"),
         (plain_run(held_out_cameras=("front",)), "no frame is left to train on"),
     ):
-        with pytest.raises(UserError, match=words):
-            training_frames([sequence], settings)
+        refuses(words, training_frames, [sequence], settings)
 
 
 def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
@@ -95,7 +87,7 @@ def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
         assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in cameras]
 
 
-def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> None:
+def test_order_backgrounds_and_density_draws_depend_on_seed_and_step_only() -> None:
     frames = training_frames([toy_sequence(12, 16)[1]], plain_run(split="none"))
     first, second, other = (
         [FrameOrder(frames, seed).at(step) for step in range(start, start + 12)]
@@ -106,9 +98,6 @@ def test_order_shows_each_frame_once_a_pass_and_depends_on_the_step_only() -> No
         assert {passes for _, passes in one} == {number}
     assert [frame for frame, _ in first] != [frame for frame, _ in second]
     assert first != other
-
-
-def test_random_backgrounds_and_density_draws_depend_on_seed_and_step() -> None:
     settings = plain_run(background="random", seed=1)
     assert background_at(settings, 3).tolist() != background_at(settings, 4).tolist()
     assert background_at(plain_run(background="white"), 3).tolist() == [255, 255, 255]
@@ -154,7 +143,7 @@ def test_loss_inside_the_box_of_difference_is_that_of_the_whole_picture(drawn, m
     assert loss["alpha"].item() == pytest.approx(expected)
 
 
-def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
+def test_adam_equals_torchs_keeps_its_state_in_the_store_and_has_rates_that_fall() -> None:
     store = GaussianStore({"means": torch.linspace(-1, 1, 12).reshape(4, 3)})
     network, adam = torch.nn.Linear(3, 2), Adam()
     twins = [torch.nn.Parameter(tensor.detach().clone()) for tensor in (store["means"], *network.parameters())]
@@ -170,13 +159,9 @@ def test_adam_equals_torchs_and_keeps_its_state_in_the_store() -> None:
     torch.testing.assert_close([store["means"], *network.parameters()], twins)
     moments = store.moments["means"]
     assert isinstance(moments, Moments)
-    assert moments.step == 5
-    assert set(adam.state()) == {"network/weight", "network/bias"}
+    assert (moments.step, set(adam.state())) == (5, {"network/weight", "network/bias"})
     assert store["means"].grad is None
-
-
-def test_rates() -> None:
-    """Learning rates fall from start to end, after their beginning. One that starts at nothing stays there."""
+    # Learning rates fall from start to end, after their beginning. One that starts at nothing stays there.
     late = Rate(1.0, 0.01, begin=0.5)
     for rate, step, expected in (
         (Rate(1.0, 0.01), 50, 0.1), (Rate(1.0, 0.01), 100, 0.01), (Rate(0.3), 70, 0.3), (Rate(0.0, 1e-3), 50, 0.0),
@@ -229,8 +214,6 @@ def test_first_colors_come_from_training_frames_only() -> None:
         assert torch.equal(first(black, first_colors="pictures"), painted) == same
 
 
-# -- targets that a worker prepares ----------------------------------------------------------------------------------
-
 SETTINGS = plain_run(steps=40, split="none", background="random")
 
 
@@ -238,7 +221,7 @@ def workers() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("mien-targets")]
 
 
-def test_native_composite_has_the_integers_of_the_reference() -> None:
+def test_native_composite_has_the_integers_of_the_reference_and_rounds_every_one() -> None:
     random = np.random.default_rng(0)
     for width in (1, 7, 8, 50, 64) * 20:
         image = random.integers(0, 256, (9, width, 3), dtype=np.uint8)
@@ -251,9 +234,6 @@ def test_native_composite_has_the_integers_of_the_reference() -> None:
         for seen, box in ((matte, None), (matte * inside, (left, 2, right - left, 5))):
             expected = composite_reference(image, seen, background, box)
             np.testing.assert_array_equal(composite(image, seen, background, box), expected)
-
-
-def test_every_integer_is_the_rounded_one() -> None:
     value, matte = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     image = np.repeat(value[..., None], 3, axis=2)
     for gray in (0, 1, 100, 255):
@@ -290,8 +270,7 @@ def test_the_queue_gives_the_targets_of_the_steps(resolution: int, background: s
 def test_the_worker_ends_with_an_error_of_its_own_and_with_an_interrupted_run(tmp_path, monkeypatch) -> None:
     face_model, sequence = toy_sequence(6, 32)
     run = partial(train, [sequence], face_model, train_toy.CONFIG, train_toy.SETTINGS)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "stopped", stopped_at(1))
+    pytest.raises(KeyboardInterrupt, run, tmp_path / "stopped", stopped_at(1))
     assert not workers()
 
     def unreadable(*_: object, **__: object) -> Target:

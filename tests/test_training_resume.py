@@ -24,6 +24,7 @@ from mien.training import train
 from mien.training.checkpoint import checkpoint_files
 from mien.training.run import read_curves, read_training_summary
 from mien.training.trainer import step
+from refusals import refuses
 from toy_scene import toy_sequence
 
 pytestmark = pytest.mark.unchecked
@@ -77,8 +78,7 @@ def test_killed_runs_end_with_the_same_bytes(fork_server: ForkServer, tmp_path: 
 
 
 def test_a_kill_before_the_first_record(tmp_path: Path, undisturbed: Path) -> None:
-    with pytest.raises(ZeroDivisionError):
-        train_until_step(tmp_path, 3, lambda: 1 // 0, checkpoint_every=1)
+    pytest.raises(ZeroDivisionError, train_until_step, tmp_path, 3, lambda: 1 // 0, checkpoint_every=1)
     assert steps_of_checkpoints(tmp_path) == [1, 2]
     train_toy.main(tmp_path, STEPS)
     assert_same_results(tmp_path, undisturbed)
@@ -94,8 +94,7 @@ def steps_of_checkpoints(run_dir: Path) -> list[int]:
 def test_a_stop_leaves_a_checkpoint_of_its_step(number, kind, tmp_path, undisturbed) -> None:
     """Also before the first record, when its curves are empty."""
     for last, stopped in ((1, 1), (6, 7)):
-        with pytest.raises(kind):
-            train_until_step(tmp_path, last, partial(signal.raise_signal, number))
+        pytest.raises(kind, train_until_step, tmp_path, last, partial(signal.raise_signal, number))
         assert steps_of_checkpoints(tmp_path)[-1] == stopped
     train_toy.main(tmp_path, STEPS)
     assert_same_results(tmp_path, undisturbed)
@@ -104,20 +103,17 @@ def test_a_stop_leaves_a_checkpoint_of_its_step(number, kind, tmp_path, undistur
 @pytest.mark.parametrize("last", [3, 8])
 def test_a_checkpoint_that_has_lost_its_curves_is_refused(last: int, tmp_path: Path) -> None:
     """Curves are empty only before the first record, which is at step 3."""
-    with pytest.raises(KeyboardInterrupt):
-        train_until_step(tmp_path, last, interrupt)
+    pytest.raises(KeyboardInterrupt, train_until_step, tmp_path, last, interrupt)
     path = checkpoint_files(tmp_path / "checkpoints")[-1]
     tensors = {name: tensor for name, tensor in read_tensors(path).items() if not name.startswith("curves.")}
     write_tensors(path, tensors, {"format": "mien.checkpoint", "version": "1"})
-    with pytest.raises(UserError, match="its curves are incomplete"):
-        train_toy.main(tmp_path, STEPS)
+    refuses("its curves are incomplete", train_toy.main, tmp_path, STEPS)
 
 
 def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     """What a run sums up over its steps counts the processes before a stop: time, peak memory, records, steps."""
     for last in (2, 4):  # the second process takes four steps, up to step 6
-        with pytest.raises(KeyboardInterrupt):
-            train_until_step(tmp_path, last, interrupt)
+        pytest.raises(KeyboardInterrupt, train_until_step, tmp_path, last, interrupt)
     path = checkpoint_files(tmp_path / "checkpoints")[-1]
     assert path.stem == "step_0000006"
     tensors = read_tensors(path)
@@ -143,8 +139,7 @@ def test_finished_run_is_loaded_and_other_settings_are_refused(undisturbed: Path
     summary = read_training_summary(undisturbed)
     assert summary["steps"] == STEPS
     assert set(summary) == {"steps", "seconds", "gaussians", "step_ms_median", "peak_memory_mb"}
-    with pytest.raises(UserError, match="settings.steps"):
-        train_toy.main(undisturbed, STEPS + 1)
+    refuses("settings.steps", train_toy.main, undisturbed, STEPS + 1)
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     with pytest.raises(UserError, match="method"):
         train([sequence], face_model, replace(train_toy.CONFIG, sh_degree=1), train_toy.SETTINGS, undisturbed)

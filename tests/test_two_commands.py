@@ -13,6 +13,7 @@ from forked import Forked, ForkServer
 from mien.cli import main
 from mien.disk.locks import lock_file
 from other_process import Holder
+from refusals import complaint
 from two_commands import RANK, Studio, beside, toy_studio
 
 pytestmark = [pytest.mark.unchecked, pytest.mark.usefixtures("short_films")]
@@ -96,9 +97,7 @@ def test_readers_go_on_beside_every_lock(other: Holder, studio: Studio, tmp_path
             assert main(words.split()) == 0, (words, capsys.readouterr().err)
 
 
-def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
-    other: Holder, studio: Studio, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_is_being_trained_cannot_be_rendered_yet(other: Holder, studio: Studio, tmp_path, capsys) -> None:
     run = studio.root / "runs" / "begun"
     run.mkdir()
     shutil.copy(studio.root / "runs" / "alone" / "config.json", run)
@@ -108,8 +107,7 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(
         line = capsys.readouterr().err
         assert f"process {other.pid} on" in line
         assert line.endswith("; try again when it is done\n")
-    assert main(render) == 2
-    assert "its training was not finished; run the same `mien train`" in capsys.readouterr().err
+    assert "its training was not finished; run the same `mien train`" in complaint(capsys, *render)
     shutil.rmtree(run)
     # A workspace whose first capture is at work.
     clip = tmp_path / "w" / "sequences" / "clip"

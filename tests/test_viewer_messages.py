@@ -103,6 +103,7 @@ def test_cameras_are_checked_and_clamped() -> None:
     for name, value in (
         ("wxyz", [0, 0, 0, 0]), ("wxyz", [1, 0, 0]), ("wxyz", [math.nan, 0, 0, 1]), ("wxyz", [1e300, 0, 0, 0]),
         ("position", [1e300, 0, 0]), ("position", [math.inf, 0, 0]), ("look_at", [0, math.nan, 0]),
+        *((name, [0, at, 0]) for name in ("position", "look_at", "up_direction") for at in (1.1e5, -1.1e5, math.nan)),
         ("up_direction", "up"), ("fov", math.nan), ("fov", None), ("image_width", math.inf),
     ):  # fmt: skip
         assert camera(**{name: value}) is None, (name, value)
@@ -145,8 +146,7 @@ def test_one_browser_cannot_end_the_viewer_for_others(serving: Serving) -> None:
 
     asyncio.run(talk())
     assert np.isfinite(session.face.joints).all()
-    assert session.height == 1080
-    assert control(serving, "Search").value == "x" * MOST_TEXT
+    assert (session.height, control(serving, "Search").value) == (1080, "x" * MOST_TEXT)
     assert serving.server.gui._current_file_upload_states == {}
     assert (serving.loop.error, serving.failures) == (None, [])
 
@@ -202,9 +202,7 @@ def test_files_wait_until_a_browser_takes_them(serving: Serving, monkeypatch: py
     assert serving.failures == []
 
 
-def test_a_failure_is_told_and_the_viewer_goes_on(
-    serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_is_told_and_the_viewer_goes_on(serving: Serving, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def fail(*arguments: object) -> None:
         raise ArithmeticError("a bug")
 
@@ -238,5 +236,4 @@ def test_hostile_messages_do_no_harm() -> None:
     """A real viewer and a real WebSocket client; `make fuzz` does the same at length."""
     figures = campaign(30, 1)
     gc.collect()  # connections that the campaign has cut, which warn in whatever test comes next otherwise
-    assert figures.findings == []
-    assert figures.messages == 30
+    assert (figures.findings, figures.messages) == ([], 30)

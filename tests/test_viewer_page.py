@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
+from known import known
+
 pytest.importorskip("viser")
 
 import msgspec
@@ -80,8 +82,7 @@ class Client:
         while True:
             for message in await self.told():
                 if message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
-                    picture = cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR)
-                    assert picture is not None
+                    picture = known(cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), cv2.IMREAD_COLOR))
                     if len(picture) == height:
                         return picture
 
@@ -162,9 +163,7 @@ def test_the_first_picture_is_that_of_the_filmed_camera(serving: Serving, sessio
     asyncio.run(talk())
 
 
-def test_a_missing_package_is_named_and_no_bug(
-    session: Session, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named_and_no_bug(session: Session, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     def draw(*_: object) -> None:
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
@@ -278,8 +277,7 @@ def test_a_port_that_is_taken_is_told_and_nothing_is_left_after_the_end(session:
     assert threads() <= before
     with pytest.raises(OSError):  # noqa: PT011
         request(port)
-    assert running.failures == []
-    assert capfd.readouterr().out == ""
+    assert (running.failures, capfd.readouterr().out) == ([], "")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
@@ -311,7 +309,7 @@ def seen_by_browser(address: str, steps: list[dict[str, Any]], size: tuple[int, 
     return told
 
 
-def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path: Path) -> None:
+def test_a_browser_shows_the_avatar_and_a_phone_the_whole_head(serving: Serving, session: Session, tmp_path) -> None:
     shots = [tmp_path / f"{index}.png" for index in range(4)]
     steps: list[dict[str, Any]] = [
         {"see": "Expressions"}, {"settled": shots[0]}, {"click": "Random face"}, {"settled": shots[1]},
@@ -330,10 +328,7 @@ def test_a_browser_shows_the_avatar(serving: Serving, session: Session, tmp_path
     visible = {name for name, slider in serving.panel.sliders.items() if slider.visible}
     assert visible & set(session.avatar.expression_names) == {"mouthSmileLeft"}
     assert (serving.loop.error, serving.failures) == (None, [])
-
-
-def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
-    """The head fits the narrow window, and the panel, which would cover half of it, is folded."""
+    # The head fits the narrow window, and the panel, which would cover half of it, is folded.
     seen_by_browser(serving.address, [{"see": "mien"}, {"settled": tmp_path / "a.png"}], (390, 844))
     drawn = np.any(read(tmp_path / "a.png")[:700] < 250, axis=-1)
     columns = np.flatnonzero(drawn.any(0))
@@ -342,6 +337,4 @@ def test_a_phone_shows_the_whole_head(serving: Serving, tmp_path: Path) -> None:
 
 
 def read(path: Path) -> np.ndarray:
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    return picture
+    return known(cv2.imread(str(path)))

@@ -18,9 +18,9 @@ import torch
 import train_toy
 from capture_helpers import tree_bytes
 from forked import ForkServer
+from known import known
 from mien import runtime
 from mien.avatar.baking import make_portable
-from mien.errors import UserError
 from mien.pipeline import live_view
 from mien.pipeline import view as viewing
 from mien.pipeline.live_view import LiveView
@@ -30,6 +30,7 @@ from mien.viewer.drawing import View
 from mien.viewer.loop import STILL_SECONDS, DrawingLoop
 from mien.viewer.session import Session
 from mien.viewer.work import Worker
+from refusals import refuses
 from test_runtime import new_avatar
 from toy_scene import toy_camera, toy_sequence
 from web_case import until
@@ -39,47 +40,42 @@ def test_only_loopback_goes_without_a_token_and_strange_hosts_and_origins_are_re
     for host in ("127.0.0.1", "::1", "localhost"):
         assert is_loopback(host), host
         assert Door.of(host, with_token=False).token is None
-    for host in ("0.0.0.0", "example.org", "192.168.1.2"):
+    for host in ("0.0.0.0", "example.org", "192.168.1.2", "localhost.evil.example", "127.0.0.1.evil.example"):
         assert not is_loopback(host), host
         assert Door.of(host).token is not None
-        with pytest.raises(UserError, match=f"--no-token: other machines can reach --host {host}"):
-            Door.of(host, with_token=False)
+        refuses(f"--no-token: other machines can reach --host {host}", Door.of, host, with_token=False)
     door = Door.of("127.0.0.1", with_token=False)
     assert door.answer("/", {"Host": "127.0.0.1:80"}) is None
     assert door.answer("/", {"Host": "localhost:80", "Origin": "http://localhost:80"}) is None
-    origins = ("http://evil.example", "http://127.0.0.1:81", "null", "http://[", "http://[v1.\udc80]")
+    ports = ("81", "8", "80.evil.example")
+    origins = ("http://evil.example", *(f"http://127.0.0.1:{port}" for port in ports), "null", "http://[v1.\udc80]")
     from_elsewhere = ({"Host": "127.0.0.1:80", "Origin": origin} for origin in origins)
-    for headers in ({}, {"Host": "rebound.example:80"}, {"Host": "[::1"}, *from_elsewhere):
+    strange = ("rebound.example:80", "[::1", "localhost.evil.example", "127.0.0.1.evil.example:80", "evil-localhost:80")
+    for headers in ({}, *({"Host": host} for host in strange), {"Origin": "http://["}, *from_elsewhere):
         answer = door.answer("/", headers)
         assert answer is not None, headers
         assert answer.status == 403
         assert answer.body.isascii() or "\udc80" not in answer.body
 
 
-def test_a_proxy_with_a_path_of_its_own() -> None:
+def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -> None:
     """The redirect and the cookie stay below that path, and other hosts are fine with the token."""
     door = Door.of("127.0.0.1")
     there = {"Host": "me.example", "Origin": "https://me.example"}
-    first = door.answer(f"/?token={door.token}", there)
-    assert first is not None
+    first = known(door.answer(f"/?token={door.token}", there))
     onward = urljoin("https://me.example/mien/?token=x", first.headers["Location"])
     assert onward == "https://me.example/mien/index.html"
     assert "Path" not in first.headers["Set-Cookie"]
     assert door.answer("/index.html", {**there, "Cookie": door.cookie}) is None
-    lost = door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie})
-    assert lost is not None
+    lost = known(door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie}))
     assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body
     assert "let the proxy pass on the browser's Host header" in lost.body
-
-
-def test_a_token_becomes_a_cookie() -> None:
     door = Door.of("0.0.0.0")
     assert door.token is not None
     assert len(door.token) >= 20
     assert door.token != Door.of("0.0.0.0").token
     here = {"Host": "me.example:80"}
-    first = door.answer(f"/?token={door.token}", here)
-    assert first is not None
+    first = known(door.answer(f"/?token={door.token}", here))
     assert (first.status, first.headers["Location"]) == (303, "index.html")
     cookie = first.headers["Set-Cookie"]
     given, *attributes = cookie.split("; ")
@@ -170,8 +166,7 @@ def test_a_picture_that_fails_concerns_its_client_alone() -> None:
     stage = Stage(1, 2, draw=draw, failed=failures.append)
     stage.look(1, 13)
     stage.look(2, 14)
-    assert [stage.loop.step() for _ in range(2)] == [0, 0]
-    assert stage.shown == [(2, 14, False)]
+    assert ([stage.loop.step() for _ in range(2)], stage.shown) == ([0, 0], [(2, 14, False)])
     stage.loop.add(3, show)
     stage.look(3, 12)
     assert stage.loop.step() == 0
@@ -180,8 +175,7 @@ def test_a_picture_that_fails_concerns_its_client_alone() -> None:
     stage.now += STILL_SECONDS
     assert [stage.loop.step() for _ in range(2)] == [0, None], "what failed is not tried again"
     stage.look(1, 15)
-    assert stage.loop.step() == 0
-    assert stage.shown[-1][:2] == (1, 15)
+    assert (stage.loop.step(), stage.shown[-1][:2]) == (0, (1, 15))
 
 
 def test_the_loop_stops_and_a_failure_that_concerns_all_ends_it_and_is_kept() -> None:
@@ -259,9 +253,7 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
     assert len(started) == 1
 
 
-def test_a_watched_training_has_the_same_bytes(
-    started: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_watched_training_has_the_same_bytes(started: list[Path], tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(live_view, "LEAST_SECONDS", 0.0)
     face_model, sequence = toy_sequence(5, 32)
     live, seen, settings = LiveView("toy", toy_camera(32)), [], replace(train_toy.SETTINGS, steps=12)
@@ -292,8 +284,7 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(viewing.time, "sleep", sleep)
     monkeypatch.setattr(viewing.os, "kill", lambda process, number: signals.append((process, number)))
     monkeypatch.setenv(live_view.PARENT_VARIABLE, str(os.getppid()))
-    with pytest.raises(StopIteration):
-        viewing.follow_file(session, file)
+    pytest.raises(StopIteration, viewing.follow_file, session, file)
     monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
     monkeypatch.setattr(viewing.time, "sleep", lambda _: None)
     viewing.follow_file(session, file)

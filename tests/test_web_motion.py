@@ -74,15 +74,12 @@ def expect_as_in_python(built: Path, folder: Path, recording: Path, notes: int =
         np.testing.assert_allclose(found[name], expected, rtol=0, atol=EQUAL, err_msg=f"{recording.name}: {name}")
 
 
-def test_every_layout_is_read_as_in_python(built: Path, tmp_path: Path) -> None:
+def test_every_layout_and_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
     names = [name for pair in PAIRS for name in pair]
     for write in (write for writers in LAYOUTS.values() for write in writers):
         recording = write(tmp_path, [{}, *({name: 0.5} for name in names), {"jawOpen": 0.5}])
         expect_as_in_python(built, tmp_path, recording)
-
-
-def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> None:
-    """Midnight, repeats, gaps, faces that are lost at first, decimal commas, transposed matrices, turns and gaze."""
+    # Midnight, repeats, gaps, faces that are lost at first, decimal commas, transposed matrices, turns and gaze.
     codes = ("23:59:59:56", "23:59:59:58", "23:59:59:58", "0:00:00:00", "0:00:00:06", "0:00:00:08")
     rows = [row(code, JawOpen=index / 8, MouthLeft=0.5, HeadYaw=0.1 * index) for index, code in enumerate(codes)]
     keep = [index for index, name in enumerate(COLUMNS) if name != "TongueOut"]
@@ -101,9 +98,11 @@ def test_odd_recordings_are_read_as_in_python(built: Path, tmp_path: Path) -> No
     ]
     expect_as_in_python(built, tmp_path, write_json(tmp_path / "task.json", results), 2)
     expect_as_in_python(built, tmp_path, write_csv(tmp_path / "turned.csv", *turned_rows()))
+    slow = write_csv(tmp_path / "slow.csv", *(row(f"0:00:0{second}:00.0", JawOpen=0.5) for second in range(4)))
+    expect_as_in_python(built, tmp_path, slow, 1)
 
 
-def test_a_page_takes_as_long_a_csv_as_python(built: Path, tmp_path: Path) -> None:
+def test_long_tables_are_read_as_in_python_and_what_is_no_recording_is_said(built: Path, tmp_path: Path) -> None:
     """A long list of rows is not spread into the arguments of a call, of which engines take some 100,000."""
     times = ((at // 108000, at // 1800 % 60, at // 30 % 60, at % 30) for at in range(COUNT))
     rows = [f"{hour}:{minute:02d}:{second:02d}:{frame:02d},61,0.5" for hour, minute, second, frame in times]
@@ -111,6 +110,9 @@ def test_a_page_takes_as_long_a_csv_as_python(built: Path, tmp_path: Path) -> No
     found = read_by_node(built, tmp_path, tmp_path / "long.csv")
     assert "error" not in found
     assert (found["moments"], found["fps"]) == (COUNT, pytest.approx(30))
+    for name, content, message in BROKEN:
+        (tmp_path / name).write_text(content)
+        assert read_by_node(built, tmp_path, tmp_path / name)["error"] == message
 
 
 def frames(count: int = 1, **parts: Any) -> str:
@@ -127,6 +129,8 @@ BROKEN = [
     ("a.csv", "Timecode,JawOpen\n1:0:0:5,0\n1:2:0:5,0\n", "has a gap of more than 60 s"),
     ("a.csv", "time,jawOpen,HeadYaw\n0,0.1,2.9\n",
      "has 2.9 for headyaw in line 2; angles are in radians, so divide degrees by 57.3"),
+    ("a.csv", "time,jawOpen,HeadYaw\n0,0,0\n0.04,0,0.1\n0.08,0,1.2\n",
+     "has 1.2 for headyaw right after 0.1; angles are in radians, so divide degrees by 57.3"),
     ("a.json", "[{", "is no json"),
     ("a.json", frames(3, timestamp_ms=lambda i: i / 30),
      'has 30000 frames in a second; give milliseconds, or call seconds "time"'),
@@ -136,12 +140,6 @@ BROKEN = [
      "has a matrix whose last row is not 0 0 0 1 in frame 0"),
     ("a.json", frames(blendshapes={"smile": 1}), "has none of this avatar's expressions"),
 ]  # fmt: skip
-
-
-def test_what_is_no_recording_is_said(built: Path, tmp_path: Path) -> None:
-    for name, content, message in BROKEN:
-        (tmp_path / name).write_text(content)
-        assert read_by_node(built, tmp_path, tmp_path / name)["error"] == message
 
 
 def test_signs_of_life_are_calm(built: Path, tmp_path: Path) -> None:

@@ -1,17 +1,23 @@
-"""The page as people meet it: it opens alive, its faces are buttons, and everybody can use it."""
+"""The page as people meet it, and its back end in WebGPU, which draws as the native renderer does."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+import web_case as web
 from mien import runtime
 from mien.cli import main
-from mien.errors import UserError
-from mien.formats.page import POSTER, Described, check_address, write_page
-from web_case import browse, drawn_head, expect_usable, faces_of, motion_of
+from mien.formats.page import POSTER, Described, check_address, write_packed, write_page
+from needs import NO_WEBGPU
+from refusals import refuses
+from test_web import REST, SHOW, SLIDE, WHITE, points, posing, skinned_head
+from test_web_element import LOADED, SHOT
+from web_case import browse, drawn_head, expect_usable, faces_of, likeness, motion_of, picture, psnr, rendered, script
 
 portable = pytest.fixture(scope="module")(lambda: drawn_head(300, rank=2))
 
@@ -68,7 +74,7 @@ KEY = """(async () => {
 })()"""
 
 
-def test_a_page_opens_alive(page: Path, portable: runtime.PortableAvatar) -> None:
+def test_a_page_opens_alive_and_faces_are_buttons(page: Path, portable: runtime.PortableAvatar) -> None:
     """The camera turns to the front, the filmed motion plays once, then the head blinks and looks at the pointer, which
     is to its left and up. With both switched off, it rests."""
     told = browse(page, [ALIVE], size=(300, 200), device=["lively"], opening=CLOCK)
@@ -77,6 +83,21 @@ def test_a_page_opens_alive(page: Path, portable: runtime.PortableAvatar) -> Non
     assert (first > 0.2, timesteps >= 2, closed > 0.3, aside > 0.25, down < -0.1) == (True,) * 5, told["results"]
     np.testing.assert_allclose(still, portable.neutral.head_rotation, atol=1e-6)
     assert opened == pytest.approx(portable.neutral.expression[portable.expression_names.index("eyeBlinkLeft")])
+    # Who asks for reduced motion gets a page that stands still, and faces that come at once.
+    told = browse(page, [STILL, PRESS, GAZE, MARKS], size=(300, 200))
+    assert (told["requests"], told["messages"]) == ([], [])
+    still, (*states, labels, (turned, playing)), (moved, pitch, *works), marks = told["results"]
+    assert (still, labels[:4]) == ([0, False, False], ["Smile", "Laugh", "Surprise", "Wink"])
+    smile, rest = runtime.Avatar(portable).face({"smile": 1.0}).expression, portable.neutral.expression
+    assert [state for state, _ in states] == ["true", "false", "true"]
+    np.testing.assert_allclose([expression for _, expression in states], [smile, rest, smile], atol=1e-3)
+    assert (turned, playing, works) == (pytest.approx(0.1), True, [False, True])
+    assert moved > 20
+    assert pitch < -0.2
+    # What was filmed goes from 0 to 1 in `drawn_head`.
+    most = portable.expression_bounds[portable.expression_names.index("jawOpen"), 1]
+    assert marks == ["0%", f"{round(100 / most)}%", False]
+    expect_usable(page, "await mien;", 'document.getElementById("more").click();')
 
 
 @pytest.mark.parametrize("looks", [-1, 1])
@@ -125,25 +146,6 @@ MARKS = """(async () => {
   const { style } = document.getElementById("jawOpen");
   return [style.getPropertyValue("--a"), style.getPropertyValue("--b"), document.getElementById("filmed").hidden];
 })()"""
-
-
-def test_faces_are_buttons_and_keys_work_without_a_click(page: Path, portable: runtime.PortableAvatar) -> None:
-    """Who asks for reduced motion gets a page that stands still, and faces that come at once."""
-    told = browse(page, [STILL, PRESS, GAZE, MARKS], size=(300, 200))
-    assert (told["requests"], told["messages"]) == ([], [])
-    still, (*states, labels, (turned, playing)), (moved, pitch, *works), marks = told["results"]
-    assert still == [0, False, False]
-    assert labels[:4] == ["Smile", "Laugh", "Surprise", "Wink"]
-    smile, rest = runtime.Avatar(portable).face({"smile": 1.0}).expression, portable.neutral.expression
-    assert [state for state, _ in states] == ["true", "false", "true"]
-    np.testing.assert_allclose([expression for _, expression in states], [smile, rest, smile], atol=1e-3)
-    assert (turned, playing, works) == (pytest.approx(0.1), True, [False, True])
-    assert moved > 20
-    assert pitch < -0.2
-    # What was filmed goes from 0 to 1 in `drawn_head`.
-    most = portable.expression_bounds[portable.expression_names.index("jawOpen"), 1]
-    assert marks == ["0%", f"{round(100 / most)}%", False]
-    expect_usable(page, "await mien;", 'document.getElementById("more").click();')
 
 
 OUTSIDE = """(async () => {
@@ -196,10 +198,152 @@ def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.P
     assert "og:" not in (tmp_path / "b.html").read_text()
     assert not (tmp_path / "b.jpg").exists()
     for address in ("me.html", "javascript:alert(1)", "https://"):
-        with pytest.raises(UserError, match="is no address; give one such as"):
-            check_address(address)
+        refuses("is no address; give one such as", check_address, address)
     runtime.write_portable(tmp_path / "c.mien", replace(drawn_head(10), filmed=None))
     given = ["--title", "Ada", "--address", "https://example.org/c.html"]
     assert main(["export", str(tmp_path / "c.mien"), "--out", str(tmp_path / "c.html"), *given]) == 0
     assert (tmp_path / "c.jpg").is_file()
     assert "<title>Ada</title>" in (tmp_path / "c.html").read_text()
+
+
+PAGE = '<link rel="icon" href="data:,"><canvas id="view" width="512" height="512"></canvas>'
+OPEN = """
+const { readAny, Viewer } = await import("./mien.js"), { findBackend } = await import("./webgpu.js");
+const file = new Uint8Array(await (await fetch("NAME.packed")).arrayBuffer());
+const { avatar } = await readAny(file), before = document.getElementById("view"), canvas = before.cloneNode();
+window.viewer?.dispose();
+before.replaceWith(canvas);
+window.viewer = new Viewer(canvas, avatar, null, await findBackend("BACKEND"));
+viewer.background = [1, 1, 1, 1];
+"""
+RESIZE = "[viewer.canvas.width, viewer.canvas.height] = [300, 300];"
+CLEAR = "viewer.background = [0, 0, 0, 0];"
+LOSE = """
+const { drawer } = viewer.renderer;
+drawer.pipelines.device.destroy();
+while (viewer.renderer.drawer === drawer) await new Promise((done) => setTimeout(done, 10));
+"""
+
+
+@pytest.fixture(scope="module")
+def site(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the package and an empty page, or skip the test if the browser has no WebGPU."""
+    folder = Path(shutil.copytree(built, tmp_path_factory.mktemp("site"), dirs_exist_ok=True))
+    (folder / "index.html").write_text(PAGE)
+    if run(folder, ["(async () => Boolean(await navigator.gpu?.requestAdapter()))()"])["results"] != [True]:
+        pytest.skip(NO_WEBGPU)
+    return folder
+
+
+def opened(name: str, backend: str = "webgpu") -> str:
+    return OPEN.replace("NAME", name).replace("BACKEND", backend)
+
+
+def run(site: Path, scripts: list[str], webgpu: bool = True) -> dict[str, Any]:
+    with web.served(site) as address:
+        return browse(f"{address}/index.html", scripts, webgpu=webgpu)
+
+
+HEADS = {
+    "gaussian_avatars": lambda: drawn_head(4000, rank=2, sh=4, sh_frame="world"),
+    "some columns": lambda: drawn_head(10_011, rank=5, columns=2), "headgas": lambda: web.painted_head(1500),
+    "mono_gaussian_avatar": skinned_head, "colors that depend on the view": lambda: points(1500)["points"],
+}  # fmt: skip
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("method", list(HEADS)[:4])
+def test_pictures_are_those_of_the_native_renderer(site: Path, method: str) -> None:
+    """Posed and sorted on the GPU."""
+    portable = HEADS[method]()
+    faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
+    write_packed(site / "drawn.packed", portable)
+    told = run(site, [script(opened("drawn")), *(script(web.taking(face), SHOW) for face in faces)])
+    expect_pictures(portable, faces, told)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("method", list(HEADS)[2:])
+def test_a_page_draws_every_kind_with_webgl2(tmp_path: Path, method: str) -> None:
+    portable = HEADS[method]()
+    faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
+    assert write_page(tmp_path / "a.html", portable).psnr >= 45
+    told = browse(tmp_path / "a.html", ["(async () => (await mien).poser.runsNetwork)()", *map(posing, faces)])
+    assert told["requests"] == []
+    assert (told["results"][0] is False) == (method == "headgas"), "its network runs on the GPU"
+    expect_pictures(portable, faces, told)
+
+
+def expect_pictures(portable: runtime.PortableAvatar, faces: list[runtime.Face], told: dict[str, Any]) -> None:
+    assert told["messages"] == []
+    expected = [rendered(portable, face)[0] for face in faces]
+    for truth, address in zip(expected, told["results"][1:], strict=True):
+        assert likeness(address, truth) >= 45
+    assert psnr(expected[1], expected[2]) < 35
+
+
+def test_size_background_and_a_lost_device(site: Path) -> None:
+    portable = drawn_head(3000, rank=2)
+    write_packed(site / "small.packed", portable)
+    (face,) = faces_of(portable, 1)
+    parts = (opened("small"), web.taking(face), RESIZE, CLEAR, LOSE)
+    told = run(site, [*(script(part, SHOW) for part in parts), script("viewer.dispose();")])
+    _, first, smaller, clear, after, _ = told["results"]
+    expected, alpha = rendered(portable, face, 300)
+    assert likeness(first, rendered(portable, face)[0]) >= 45
+    assert picture(smaller).shape[:2] == (300, 300)
+    assert likeness(smaller, expected) >= 45
+    # WebGL2 has drawn the face that WebGPU had posed.
+    for address in (clear, after):
+        assert np.abs(picture(address)[..., 3] - alpha).max() < 0.02
+    assert psnr(picture(after)[alpha > 0.9], picture(clear)[alpha > 0.9]) >= 45
+    (message,) = told["messages"]
+    assert message.startswith("mien: the WebGPU device is lost (")
+    assert message.endswith("; WebGL2 draws instead")
+
+
+def test_webgl2_draws_where_webgpu_cannot(site: Path) -> None:
+    """A browser without half floats stands for a device with too little memory."""
+    lacking = "this avatar needs half floats, which this browser's WebGPU lacks"
+    for portable, backend, webgpu, before, reason in (
+        (drawn_head(500), "webgpu", False, "", "WebGPU has no adapter here"),
+        (drawn_head(500), "auto", True, "", "WebGPU has an adapter in software only"),
+        (drawn_head(500), "webgl2", True, "", None),
+        (web.painted_head(300), "webgpu", True, "delete window.Float16Array;", lacking),
+    ):
+        write_packed(site / "few.packed", portable)
+        told = run(site, [script(before, opened("few", backend), SHOW)], webgpu=webgpu)
+        # Chromium itself has a word to say about adapters.
+        ours = [message for message in told["messages"] if message.startswith("mien")]
+        assert ours == ([f"mien: {reason}; WebGL2 draws instead"] if reason else [])
+        assert likeness(told["results"][0], rendered(portable)[0]) >= 45, reason
+
+
+def test_a_page_draws_with_webgpu(site: Path, tmp_path: Path) -> None:
+    """If it is asked to by its address. By itself it does so on a GPU only."""
+    portable, page = drawn_head(3000, rank=2), tmp_path / "a.html"
+    write_page(page, portable, webgpu=True)
+    plain = write_page(tmp_path / "b.html", portable)
+    assert 0 < page.stat().st_size - plain.size < 25_000
+    (face,) = faces_of(portable, 1)
+    told = browse(page, [posing(face), REST, script(WHITE, SLIDE, SHOW)], fragment="webgpu", webgpu=True)
+    assert (told["requests"], told["messages"]) == ([], [])
+    posed, rest, slid = told["results"]
+    assert likeness(posed, rendered(portable, face)[0]) >= 45
+    assert np.abs(picture(slid) - picture(rest)).max() > 0.1
+    told = browse(page, ["mien.then(() => 0)"], webgpu=True)
+    assert told["messages"] == ["mien: WebGPU has an adapter in software only; WebGL2 draws instead"]
+
+
+def test_the_element_draws_with_webgpu(site: Path) -> None:
+    portable = drawn_head(3000, rank=2)
+    write_packed(site / "me.packed", portable)
+    (site / "element.html").write_text(
+        '<link rel="icon" href="data:,"><script type="module" src="element.js"></script>'
+        '<mien-avatar src="me.packed" backend="webgpu" expression="jawOpen:0.5"></mien-avatar>'
+    )
+    steps = [script(LOADED, SHOT), "Boolean(avatar.viewer.renderer.drawer)"]
+    with web.served(site) as address:
+        told = browse(f"{address}/element.html", steps, webgpu=True)
+    assert (told["messages"], told["results"][1]) == ([], True)
+    assert likeness(told["results"][0], rendered(portable, {"jawOpen": 0.5}, 320)[0]) >= 45

@@ -282,14 +282,11 @@ def test_a_mouth_that_is_open_at_first_is_not_neutral(built: Path) -> None:
     assert before[1] > 0.2 > 1e-2 > abs(after[1])
 
 
-def test_a_lost_face_says_nothing_and_one_far_away_stays_in_the_picture(built: Path) -> None:
+def test_a_lost_face_says_nothing_and_smoothing_is_that_of_the_viewer(built: Path) -> None:
     lost = {"scores": None, "matrix": None, "milliseconds": 2000, "work": 1}
     assert followed(built, True, [*second_at_rest(), lost])["readings"][-1] is None
     far = [found(1.1 + i / 30, AT_REST, REST_TURN, (0.5, -0.4, -1)) for i in range(60)]
     assert np.abs(followed(built, False, second_at_rest() + far)["readings"][-1]["shift"]).max() <= 0.08
-
-
-def test_smoothing_is_that_of_the_viewer(built: Path) -> None:
     values, step = np.random.default_rng(1).standard_normal(40), 1 / 30
     smooth = {"smoothing": {"rest": 1.5, "follow": 6}, "values": values.tolist(), "step": step}
     smoothed = followed(built, False, [], smooth=smooth)["smoothed"]

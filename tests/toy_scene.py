@@ -11,6 +11,7 @@ from mien.avatar.gaussian_avatars.surface import GaussianSurface
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.face import FaceModel, FaceParams
+from mien.gaussians import SH_C0
 from mien.runtime.posing import Face
 from mien.tracking.tracking import Tracking
 from mien.training.footage.sequence import Sequence
@@ -19,6 +20,11 @@ from mien.training.footage.sequence import Sequence
 def random(*shape: int, seed: int = 0) -> Tensor:
     """Standard normal numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def rgb_from_sh(dc: Tensor) -> Tensor:
+    """Colours of constant SH coefficients [..., 3], clamped to 0 from below as in the renderers."""
+    return torch.clamp_min(dc * SH_C0 + 0.5, 0)
 
 
 def toy_face_model(rings: int = 9, around: int = 12) -> FaceModel:
@@ -135,9 +141,7 @@ def _facing(vertices: Tensor, faces: Tensor) -> Tensor:
 
 def sphere(rings: int, around: int, kept: int = -1, margin: float = 0.15) -> tuple[Tensor, Tensor]:
     """Return the vertices of a unit sphere of rings from top to bottom, and its triangles.
-
-    Only the first rings are kept if there are more. The holes at its poles have a radius of `margin`.
-    """
+    Only the first rings are kept if there are more. The holes at its poles have a radius of `margin`."""
     polar = torch.linspace(margin, math.pi - margin, rings)[:, None][: kept if kept > 0 else rings]
     angle = torch.linspace(0, 2 * math.pi, around + 1)[:-1]
     x, z = polar.sin() * angle.sin(), polar.sin() * angle.cos()

@@ -17,10 +17,9 @@ from plain_settings import plain_config, plain_run
 from toy_scene import toy_sequence
 
 CONFIG = plain_config(
-    DEFAULT_METHOD,
-    density=GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400),
+    DEFAULT_METHOD, density=GradientSettings(start=0.2, stop=0.8, rounds=4, grow_gradient=1e-4, max_gaussians=400),
     face_tuning=FaceTuning(enabled=True),
-)
+)  # fmt: skip
 SETTINGS = plain_run(steps=30, split="none", background="random", checkpoint_every=4, record_every=3)
 
 

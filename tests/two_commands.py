@@ -34,9 +34,7 @@ def beside(
     server: ForkServer, folder: Path, stop: tuple[str, str], first: list[str], second: list[str]
 ) -> tuple[Forked, Forked]:
     """Run a command up to a lock, then another one to its end, and then the first one to its end.
-
-    The first stops "before" or "within" its first lock of a place, whose name `stop` has, too. The folder is made.
-    """
+    The first stops "before" or "within" its first lock of a place, whose name `stop` has, too. The folder is made."""
     folder.mkdir()
     waiting = server.call("two_commands:run_up_to_a_lock", first, *stop, str(folder), exits=True)
     wait_until(lambda: (folder / "waits").exists() or waiting.poll() is not None)

@@ -161,10 +161,8 @@ def browse(
     device: Sequence[str] = (), **more: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """Run scripts in a page, a file or an address: their `results`, all `requests`, and `messages` of the console.
-
     The browser is what `device` lists: lively (it does not ask for reduced motion), dark, touch, mobile. See
-    web/tests/browser.mjs for what `more` can ask for, such as screenshots and flags.
-    """
+    web/tests/browser.mjs for what `more` can ask for, such as screenshots and flags."""
     chromium()
     address = f"{page}#{fragment}" if fragment else str(page)
     told = {"width": size[0], "height": size[1], "scripts": list(scripts), **dict.fromkeys(device, True), **more}
@@ -222,9 +220,7 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
 
 def violations(page: Path | str, size: tuple[int, int], device: Sequence[str] = (), *steps: str) -> list[list[str]]:
     """Return what axe-core finds in a page with all parts unfolded: each rule, and the first element that breaks it.
-
-    With steps, which are JavaScript, the page is looked at after each of them.
-    """
+    With steps, which are JavaScript, the page is looked at after each of them."""
     node()
     axe = (package("axe-core") / "axe.min.js").read_text()
     look = """
@@ -245,10 +241,8 @@ def drawn_head(
     count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head", columns: int | None = None, features: int = 0
 ) -> runtime.PortableAvatar:
     """Return `count` Gaussians in random colours on the mean head of anny, 0.9 m in front of the camera.
-
     Their changes have `rank` activations, of which the bases take the first `columns` (None: all). They have as many
-    `features`, without numbers of their own and biases.
-    """
+    `features`, without numbers of their own and biases."""
     model = load_face_model("anny")
     portable = make_portable(
         GaussianAvatars(plain_gaussian_avatars(), model, model.neutral()), toy_camera(512), "drawn"

@@ -1,7 +1,5 @@
 """Run cases over all targets in processes of their own, and collect the findings by cause in a table.
-
-A process runs many cases in a row, until one ends it. A finding is then tried again alone.
-"""
+A process runs many cases in a row, until one ends it. A finding is then tried again alone."""
 
 import faulthandler
 import json

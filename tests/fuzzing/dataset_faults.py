@@ -1,7 +1,5 @@
 """Faults of datasets by their meaning: a missing camera, hostile pickles, zip bombs, links.
-
-Other lengths, NaN and the like are faults of a format (`fuzzing.formats`).
-"""
+Other lengths, NaN and the like are faults of a format (`fuzzing.formats`)."""
 
 import json
 import os
@@ -32,9 +30,7 @@ class RunsCode:
 
 def faulty_dataset(root: Path, canary: Path, dice: Random, only: str | None = None) -> str:
     """Make one fault in a copy of a dataset, of any kind or of one, and return what it is.
-
-    Links lead into the folder `canary` outside, and hostile pickles make a folder there.
-    """
+    Links lead into the folder `canary` outside, and hostile pickles make a folder there."""
     kinds = list(KINDS)
     dice.shuffle(kinds)
     files = sorted(each for each in root.rglob("*") if each.is_file() and each.name != "truth.npz")  # for the tests

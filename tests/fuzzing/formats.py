@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import pickletools
+import re
 import struct
 import zipfile
 import zlib
@@ -181,6 +182,8 @@ def _gzip_of_zeros(head: bytes, amount: int) -> bytes:
 
 def faulty_spz(data: bytes, dice: Random) -> tuple[str, bytes]:
     """Make a fault in the header or the columns of a .spz, or in the gzip around them."""
+    if not data.startswith(b"\x1f\x8b"):  # version 4
+        return kinds.faulty_bytes(data, dice, 130)
     plain, kind = gzip.decompress(data), dice.choice((*("inner",) * 6, "claim", "bomb", "gzip", "members"))
     if kind == "claim":  # as many Gaussians as it says, all of them zero
         count, degree = dice.choice((100_000, 2_000_000, 2_000_001)), dice.randrange(5)
@@ -305,7 +308,7 @@ def faulty_pickle(data: bytes, dice: Random) -> tuple[str, bytes]:
 
 
 def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
-    head, mark, body = data.partition(b"end_header\n")
+    head, mark, body = re.split(rb"(end_header(?:\r\n|\r|\n))", data, maxsplit=1)
     if dice.random() < 0.6:
         numbers = " ".join(str(edge_number(dice)) for _ in range(dice.choice((0, 1, 16, 17, 10_000))))
         lines = (f"comment mien frame {numbers}", f"comment T_world_local {numbers}", "property list uchar int x",

@@ -1,8 +1,7 @@
 """Kill commands at random moments and run them again: `PYTHONPATH=tests python -m fuzzing.kills --kills 200`.
 
 A chain begins with the files that an uninterrupted command found. The command is killed one to five times in a row, by
-SIGKILL, SIGTERM or SIGINT, and then runs to its end. All files must have the bytes of the uninterrupted command.
-"""
+SIGKILL, SIGTERM or SIGINT, and then runs to its end. All files must have the bytes of the uninterrupted command."""
 
 import argparse
 import itertools
@@ -34,12 +33,9 @@ TRACK = (
 )  # fmt: skip
 TRAIN = ("--preset", "draft", "--steps", "30", "--training.checkpoint-every", "4")
 STAGES = {
-    "capture": ("capture", CLIP, "--out", "W"),
-    "track": ("track", "W", *TRACK),
-    "train": ("train", "W", *TRAIN),
-    "evaluate": ("evaluate", "W"),
-    "export": ("export", "W", "--out", "me.mien"),
-}
+    "capture": ("capture", CLIP, "--out", "W"), "track": ("track", "W", *TRACK), "train": ("train", "W", *TRAIN),
+    "evaluate": ("evaluate", "W"), "export": ("export", "W", "--out", "me.mien"),
+}  # fmt: skip
 """Name of a stage -> its command, in the order of a user."""
 SIGNALS = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 143, signal.SIGINT: 130}
 """Signal -> exit code of a command that has begun its work."""
@@ -100,9 +96,7 @@ class Place:
         self, stage: str, apart: bool = False, number: int = signal.SIGKILL, moment: float = _TO_FINISH
     ) -> tuple[int | None, str, float]:
         """Run a stage's command, as a fork or as a new process (`apart`), which gets a signal at a moment in seconds.
-
-        Return the exit code (None if it hangs), what it told, and its seconds after the signal.
-        """
+        Return the exit code (None if it hangs), what it told, and its seconds after the signal."""
         start = self._server.call("fuzzing.kills:run_anew", STAGES[stage], cwd=self.box, exits=True) if apart else None
         command = start or self._server.mien(*STAGES[stage], cwd=self.box)
         sent = time.monotonic()

@@ -139,7 +139,9 @@ _TOKEN = re.compile(r"[^\s,\[\]{}()\"=]+")
 
 def faulty_text(data: bytes, dice: Random, lines: tuple[str, ...] = ()) -> tuple[str, bytes]:
     """Make a fault in a text: in its words and numbers, its lines (some may be inserted), columns or encoding."""
-    text = data.decode("utf-8", "replace")
+    encoding = json.detect_encoding(data)
+    text = data.decode(encoding, "replace")
+    comma = max(",;\t", key=text.partition("\n")[0].count)
     kind = dice.choice(("token",) * 6 + ("lines", "lines", "columns", "encoding", "encoding", "deep") + ("insert",) * 3)
     if kind == "token":
         found = list(_TOKEN.finditer(text))
@@ -150,17 +152,17 @@ def faulty_text(data: bytes, dice: Random, lines: tuple[str, ...] = ()) -> tuple
             text = text[: one.start()] + other + text[one.end() :]
     elif kind == "lines" and text:
         text = "\n".join(faulty_list(text.splitlines(), dice)) + dice.choice(("\n", ""))
-    elif kind == "columns" and "," in text:
-        rows = [line.split(",") for line in text.splitlines()]
+    elif kind == "columns" and comma in text:
+        rows = [line.split(comma) for line in text.splitlines()]
         order = faulty_list(range(len(rows[0])), dice)
-        text = "\n".join(",".join(row[index] for index in order if index < len(row)) for row in rows)
+        text = "\n".join(comma.join(row[index] for index in order if index < len(row)) for row in rows)
     elif kind == "insert":
         rows = text.splitlines()
         rows.insert(dice.randrange(len(rows) + 1), dice.choice((*lines, "", "x" * 200_000, '"', '"' * 1001, *TEXTS)))
         text = dice.choice(("\n", "\n", "\r\n", "\r")).join([*rows, ""])
     elif kind == "deep":
         text = dice.choice((nested(dice.choice((900, 1000, 100_000))), "\n" * 100_000, "," * 100_000, ""))
-    whole = text.encode("utf-8", "surrogatepass")
+    whole = text.encode(encoding, "surrogatepass")
     return kind, _faulty_encoding(whole, dice) if kind == "encoding" else whole
 
 

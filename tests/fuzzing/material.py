@@ -18,6 +18,7 @@ import pytest
 import torch
 
 import train_toy
+from capture_helpers import encode as encode_video
 from capture_helpers import write_rig
 from flame_like import write_pickle
 from fuzzing.formats import npy_of, zip_of
@@ -25,8 +26,10 @@ from mien.avatar import Avatar, load_avatar
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import write_avatar
 from mien.avatar.methods import METHODS
+from mien.batch.plan import Batch, State
+from mien.commands.batch_table import read_table
 from mien.disk.config import encode
-from mien.disk.files import write_json
+from mien.disk.files import write_json, write_tensors
 from mien.evaluation import evaluate
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import EvaluationSettings
@@ -53,12 +56,13 @@ from mien.runtime import write_portable
 from mien.tracking import track_subject
 from mien.tracking.fitting.resume import StageCache
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
+from mien.training.frame_gains import GAINS
 from mien.training.run import read_face_track
 from photometric_case import make_photometric_case, make_textured_model
 from plain_settings import plain_config
 from recordings import LAYOUTS
+from shared_things import write_toy_workspace
 from toy_scene import sphere, toy_camera, toy_face_model, toy_sequence
-from toy_workspace import write_toy_workspace
 from what_users_give import write_what_users_give
 
 RUN, SEQUENCE, ANALYSIS, PIECES = "W/runs/toy", "W/sequences/clip", "W/analysis/toy", "pieces"
@@ -74,9 +78,7 @@ _WEB = Path(__file__).parents[2] / "web"
 
 def make_material(root: Path, whole: bool = True) -> None:
     """Write everything below `root`, with the same bytes every time on one machine.
-
-    What takes seconds is only there if it is to be `whole`: the pieces of a tracking, and the runtime of pages.
-    """
+    What takes seconds is only there if it is to be `whole`: the pieces of a tracking, and the runtime of pages."""
     torch.set_num_threads(1)
     root.mkdir(parents=True, exist_ok=True)
     write_toy_workspace(root / "W")
@@ -102,9 +104,13 @@ def make_material(root: Path, whole: bool = True) -> None:
     bent = {"id": "08", **one, "offset": 2, "distortion": [0.1, -0.05, 0.001, 0.0, 0.0]}
     (root / "rig").mkdir()
     write_rig(root / "rig" / "rig.json", {"id": "00", **one}, bent)
+    write_tensors(root / RUN / GAINS, {"gains": torch.linspace(0.8, 1.25, 15).reshape(5, 3)})
     (root / "takes").mkdir()
     for write in (write for writers in LAYOUTS.values() for write in writers):
         write(root / "takes", [{"jawOpen": index / 8, "eyeBlinkLeft": 0.5} for index in range(4)])
+    _write_films(root)
+    _write_splats(root / "splats", load_avatar(root / RUN))
+    _write_tables(root)
     if whole:
         _write_pieces(root / PIECES)
         _write_packed(root)
@@ -176,6 +182,67 @@ def _write_videos(folder: Path) -> None:
         with contextlib.suppress(Exception):  # webm does not take H.264
             write_video(folder / f"clip.{ending}", list(noise), 25.0, preset="ultrafast")
     assert (folder / "clip.mp4").is_file()
+
+
+def _write_films(root: Path) -> None:
+    """Write films with two streams, with two sizes and with alpha, and pictures with alpha beside a hidden file."""
+    # Here, because they draw when they are imported, which starts threads before the fuzzer forks.
+    from test_changing_pictures import VIDEOS, write_pieces
+    from test_odd_footage import write_tracks
+
+    (root / "films").mkdir()
+    (root / "alphas").mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (4, 48, 64, 4), dtype=np.uint8)
+    noise[:, :, :20, 3], opaque = 0, [np.ascontiguousarray(one[..., :3]) for one in noise]
+    write_tracks(root / "films/streams.mkv", [(opaque, False), ([one[::2, ::2] for one in opaque], True)])
+    small = [np.ascontiguousarray(one[:32, :32]) for one in opaque]
+    write_pieces(root / "films/sizes.ts", opaque, small, [one[:24] for one in opaque])
+    for piece in range(3):
+        (root / f"films/{piece}.ts").unlink()
+    for kind in ("prores 4444.mov", "vp9.webm"):
+        codec, layout, options = VIDEOS[kind]
+        frames = [av.VideoFrame.from_ndarray(one, format="rgba").reformat(format=layout) for one in noise]
+        encode_video(root / "films" / kind, frames, codec, layout, options=options)
+    for kind, levels in (("a.png", noise[0]), ("b.webp", noise[0]), ("c.tiff", noise[0].astype(np.uint16) * 257)):
+        assert cv2.imwrite(str(root / "alphas" / kind), levels)
+    (root / "alphas/._a.webp").write_bytes(b"\0\x05\x16\x07" + bytes(60))
+
+
+def _write_splats(folder: Path, avatar: Avatar) -> None:
+    """Write files of Gaussians as other programs do: line ends of Windows, doubles, packed, old and new .spz."""
+    from test_export import spz, written
+
+    folder.mkdir()
+    written(folder / "doubles.ply", {"*": "float64", "label": "uint32"}, "\r\n")
+    written(folder / "colors.ply", {"red": "uint8"}, "\r", 1)
+    plain = (folder / "colors.ply").read_bytes()
+    (folder / "packed.ply").write_bytes(plain.replace(b"end_header", b"property uint packed_position\rend_header", 1))
+    spz(folder / "old.spz", 2, [(128, 127, 128), (255, 128, 127), (0, 127, 128)], 1)
+    with torch.no_grad():
+        write_spz(folder / "new.spz", in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
+
+
+def _write_tables(root: Path) -> None:
+    """Write tables as spreadsheets do, takes and landmarks among them, and the folder of a batch."""
+    (root / "tables").mkdir()
+    (root / "tables/ann.mp4").touch()
+    cells = (("name", "video", "age", "capture.start"), ("ann", "ann.mp4", "31", '"0,5"'))
+    for name, separator, encoding in (("a", ";", "utf-8-sig"), ("b", "\t", "utf-16"), ("c", ",", "utf-8")):
+        text = "".join(separator.join(line) + "\r\n" for line in cells)
+        (root / f"tables/people_{name}.csv").write_bytes(text.encode(encoding))
+        take = (root / "given/take.csv").read_text().replace(",", separator)
+        (root / f"takes/{name}.csv").write_bytes(take.encode(encoding))
+    points = (root / "given/points.csv").read_text()
+    (root / "given/points.utf16.csv").write_bytes(points.replace(",", ";").encode("utf-16"))
+    (root / "tables/people.json").write_text(json.dumps([{"video": "ann.mp4", "age": 3}]))
+    rows = read_table(root / "tables/people_c.csv")
+    batch = Batch(root / "batch")
+    batch.write_plan(rows)
+    runs = ({"run": "headgas", "method": "headgas", "psnr": 30.0, "ssim": 0.9, "perceptual": 0.1},)
+    batch.write_state(State("ann", "done", rows[0].fingerprint, 1, "here", 1e9, 60.0, {"train": 50.0}, runs=runs))
+    (root / "nerfstudio").mkdir()
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+    (root / "nerfstudio/transforms.json").write_text(json.dumps({"fl_x": 500, "frames": frames}))
 
 
 def new_avatar(method: str) -> Avatar:

@@ -2,8 +2,7 @@
 
 Arrays are given by words: `"n 3"` is of normal numbers, `"+n 3"` of positive ones, `"%n 3"` of numbers from 0 to 1,
 `"=n 3"` of zeros to be filled, and `"<v n 3"` of integers below v. `"?n 3"` is None half the time, and `:i4` gives a
-type. A letter is a length that holds for the whole call. `h^` is rounded up to 16, and `3?` is left out at times.
-"""
+type. A letter is a length that holds for the whole call. `h^` is rounded up to 16, and `3?` is left out at times."""
 
 import math
 from collections.abc import Callable

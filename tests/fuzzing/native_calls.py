@@ -5,8 +5,7 @@
 Each call is a valid one (`native_baselines.py`) with one to three arguments changed: shapes, types, strides, alignment,
 indices, integers at the edges, NaN, objects of other calls. An error in Python is fine, as long as it is one of
 `REFUSALS`. A report of a sanitizer, a signal or 20 seconds of silence is a finding, and is printed with the command
-that runs that call alone. Every call has its own random numbers, which depend on the seed and the call's number.
-"""
+that runs that call alone. Every call has its own random numbers, which depend on the seed and the call's number."""
 
 import argparse
 import collections

@@ -1,8 +1,7 @@
 """Correct checksums and hashes after a fault, as an attacker would.
 
 This module uses none of mien's functions, since a change of theirs would silently change what is fuzzed. A test repairs
-one harmless edit of each format and reads it. Files that are too faulty to be repaired stay as they are.
-"""
+one harmless edit of each format and reads it. Files that are too faulty to be repaired stay as they are."""
 
 import contextlib
 import hashlib

@@ -7,13 +7,14 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from fuzzing import faults, lines, uses
+from fuzzing import commands, faults, lines, uses
 from fuzzing.faults import Place
 from fuzzing.material import ANALYSIS, PIECES, RUN, SEQUENCE, go_on
 from mien.avatar import load_avatar
 from mien.capture import read_capture
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.person.given import read_landmarks
+from mien.commands.batch_table import read_table
 from mien.commands.parsing.config_file import read_config_file
 from mien.driving.sources.speech import read_speech
 from mien.evaluation.image_folders import read_crops
@@ -31,6 +32,7 @@ from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
 from mien.tracking import read_tracking
 from mien.tracking.scoring_files import read_scoring
+from mien.training.frame_gains import read_gains
 from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
 Read = Callable[[Path, Path], Any]
@@ -87,7 +89,7 @@ def _on_flame(root: Path, file: Path) -> Any:
 
 
 def _read_splats(root: Path, file: Path) -> Any:
-    return {".spz": read_spz, ".sog": read_sog}.get(file.suffix, read_usd)(file)
+    return {".ply": read_ply, ".spz": read_spz, ".sog": read_sog}.get(file.suffix, read_usd)(file)
 
 
 _TARGETS = (
@@ -108,6 +110,8 @@ _TARGETS = (
     Target("checkpoints", f"{RUN}/checkpoints/*.safetensors", uses.resume_run, uses.use_training, 2),
     Target("faces of a run", f"{RUN}/face_track.safetensors",
            lambda root, file: load_experiments(root / RUN, [root / SEQUENCE]), weight=0.3),
+    Target("gains", f"{RUN}/gains.safetensors", lambda root, file: read_gains(root / RUN, [5]), uses.use_evaluation,
+           1.5, True),
     Target("metrics.json", f"{RUN}/metrics.json", lambda root, file: uses.known(read_metrics(root / RUN)),
            uses.use_comparison, 2, True),
     Target("analysis.json", f"{ANALYSIS}/analysis.json", uses.read_analysis, weight=2, exact=True),
@@ -129,13 +133,22 @@ _TARGETS = (
     Target("pictures", "pictures/*", uses.read_pictures, weight=5),
     Target("mattes", "given/mattes/*", uses.read_mattes, uses.expect_finite),
     Target("points", "given/points.*", lambda root, file: read_landmarks(file, 3), uses.expect_rows, 2),
+    Target("films", "films/*", commands.read_film, commands.capture_film, 3),
+    Target("alphas", "alphas/*", lambda root, file: commands.read_film(root, file.parent), commands.capture_film, 2),
+    Target("driving pictures", "alphas/*", lambda root, file: None, commands.drive_by_pictures, named=False,
+           fault=faults.any_fault, parts=("W", "cache")),
     Target("crops.json", "given/crops.json", _of(read_crops), uses.expect_finite),
     Target("cameras.json", "given/cameras.json", _of(read_cameras), uses.use_cameras, 1.5, parts=("head.ply",)),
     Target("rig.json", "rig/rig.json", _of(read_calibration), uses.use_rig, 2),
+    Target("transforms.json", "nerfstudio/transforms.json", _of(read_calibration), uses.use_rig, 0.5),
     Target("take.csv", "given/take.csv", uses.read_motion, uses.expect_motion, 2),
     Target("take.json", "given/*take.json", uses.read_motion, uses.expect_motion, 2),
     Target("takes", "takes/*", uses.read_motion, uses.expect_motion, 4),
     Target("sounds", "sounds/*", _of(read_speech), uses.expect_motion, 3),
+    Target("tables", "tables/people*", _of(read_table), commands.run_batch, 3),
+    Target("states of a batch", "batch/states/*", commands.read_batch, commands.run_batch, 2, named=False,
+           parts=("tables",)),
+    Target("plan.json", "batch/plan.json", commands.read_batch, commands.run_batch, named=False, parts=("tables",)),
     Target("tiny.npz", "flame/tiny.npz", _of(read_flame), uses.use_face_model, 2),
     Target("tiny.pkl", "flame/tiny.pkl", _of(read_flame), uses.use_face_model, 2),
     Target("point_cloud.ply", "gaussian_avatars/point_cloud.ply", **_FOLDER, weight=2),
@@ -149,6 +162,7 @@ _TARGETS = (
     Target("scene of a .glb", "exports/head.glb", uses.read_scene, weight=2),
     Target("avatar of a .glb", "exports/head.glb", _of(read_glb_avatar), uses.use_portable, 2),
     Target("head.spz", "exports/head.spz", _read_splats, uses.use_gaussians, 3),
+    Target("splats", "splats/*", _read_splats, uses.use_gaussians, 4),
     Target("head.sog", "exports/head.sog", _read_splats, uses.use_gaussians, 3),
     *(Target(f"head.{ending}", f"exports/head.{ending}", _read_splats, uses.use_gaussians, fault=faults.faulty_new_name)
       for ending in ("usd", "usda", "usdc", "usdz")),

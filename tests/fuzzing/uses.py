@@ -32,6 +32,7 @@ from mien.datasets.dataset import TrainedAvatar
 from mien.datasets.registry import datasets, recognised
 from mien.datasets.writing import write_sequence
 from mien.disk.files import read_tensors
+from mien.disk.inside import is_one_line
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving import drive
 from mien.driving.motion import Motion
@@ -364,12 +365,13 @@ def run_line(line: str, root: Path) -> None:
 def run_words(words: list[str], root: Path) -> None:
     """Run a command in this process. A refusal is raised as a `UserError`, another end as a `CommandError`."""
     os.environ["MIEN_CACHE"] = str(root / "cache")
-    told = io.StringIO()
-    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
+    told, shown = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(shown):
         try:
             code: Any = cli.main(words)
         except SystemExit as stop:
             code = stop.code
+    assert all(map(is_one_line, shown.getvalue().split("\n"))), "control characters on standard output"
     lines = [line for line in told.getvalue().splitlines() if line.startswith("mien: ")]
     if code == cli.EXIT_USER_ERROR and len(lines) == 1:
         raise UserError(lines[0])

@@ -1,8 +1,7 @@
 """Single values that a reader must refuse, whatever the checksums say, by target: in json, and in arrays.
 
 A row is the place of a value and the value; `GONE` takes it away. Files are edited with correct checksums around them.
-In arrays, a value may be a function that returns another array.
-"""
+In arrays, a value may be a function that returns another array."""
 
 import itertools
 import json
@@ -190,6 +189,10 @@ VALUES: dict[str, tuple[Row, ...]] = {
         ("@baked.attributes.log_scales", fill(1000)), ("@baked.attributes.sh", lambda array: array[:, [0, 0]]),
         ("@baked.means", typed(np.float64)), ("@baked.means", first(3)), ("@*", last),
     ),
+    "gains": (
+        ("gains", fill(np.nan)), ("gains", fill(0)), ("gains", fill(1e3)), ("gains", first(3)), ("gains", GONE),
+        ("gains", typed(bool)), ("+dtype gains", "F8_E4M3"),
+    ),
     "crops.json": tuple(("crops.0\\.png", box) for box in (
         [0, 0, HUGE, 4], [-HUGE, 0, 4, 4], [True, 0, 4, 4], [0, 0, 4.0, 4], [0, 0, 4, 10**7])),
     "cameras.json": (
@@ -214,7 +217,7 @@ SANE: dict[str, Row] = {
     "curves.safetensors": ("loss", plus(1e-4)), "face_track.safetensors": ("expression", plus(1e-4)),
     "avatar.safetensors": (f"{_STORE}.trained.opacity_logits", plus(1e-4)),
     "face_model.safetensors": ("expression_basis", plus(1e-4)),
-    "head.mien": ("@baked.attributes.opacity_logits", plus(1e-4)),
+    "head.mien": ("@baked.attributes.opacity_logits", plus(1e-4)), "gains": ("gains", times(1.01)),
 }  # fmt: skip
 """Edits that readers must accept, since everything around them is corrected; otherwise checksums would hide faults."""
 

@@ -1,8 +1,7 @@
 """Send hostile messages to a running viewer: `PYTHONPATH=tests python -m fuzzing.viewer_messages --count 200 --seed 1`.
 
 The messages come from WebSocket clients with the viewer's token, as a browser that somebody has taken over. Afterwards,
-a fresh browser must get a picture, the memory must be bounded, and SIGTERM must end the process soon.
-"""
+a fresh browser must get a picture, the memory must be bounded, and SIGTERM must end the process soon."""
 
 import argparse
 import asyncio

@@ -80,8 +80,7 @@ class Workshop:
         """Mutate one file, run the tests of the case, and put the file back.
 
         Raises:
-            MutationError: the text is not in the file exactly once, or a test fails without the mutation.
-        """
+            MutationError: the text is not in the file exactly once, or a test fails without the mutation."""
         path = self.folder / case.file
         sound = path.read_text(encoding="utf-8")
         if sound.count(case.old) != 1:

@@ -25,6 +25,8 @@ export interface Series {
 }
 
 const MAX_GAP = 60, MAX_MOMENTS = 500_000;
+/** Least number of rows a second of a recording of a face. */
+const SLOWEST = 5;
 
 /** The text of a file: UTF-16 if it begins with that mark, else UTF-8. */
 export function textOf(content: ArrayBuffer): string {
@@ -75,14 +77,16 @@ function evenly(rows: Row[], { seconds, slack }: Series, notes: string[]): { row
   if (steps.some((one) => one > MAX_GAP)) throw new AvatarError(`has a gap of more than ${MAX_GAP} s`);
   if (Math.max(span / step, own.length) > MAX_MOMENTS) throw new AvatarError(`has more than ${MAX_MOMENTS} moments`);
   const count = Math.round(span / step) + 1;
-  if (count === own.length && times.every((time, i) => Math.abs(time - times[0] - step * i) < 0.5 * step)) return { rows: own, fps: (count - 1) / span };
+  const isEven = count === own.length && times.every((time, i) => Math.abs(time - times[0] - step * i) < 0.5 * step), fps = isEven ? (count - 1) / span : 1 / step;
+  if (fps < SLOWEST) notes.push(`has ${Number(fps.toPrecision(2))} rows a second, and recordings of faces have at least ${SLOWEST}`);
+  if (isEven) return { rows: own, fps };
   let before = 0;
   const filled = Array.from({ length: count }, (_, i) => {
     const time = times[0] + step * i;
     while (before + 2 < times.length && times[before + 1] <= time) ++before;
     return between(own[before], own[before + 1], Math.min((time - times[before]) / (times[before + 1] - times[before]), 1));
   });
-  return { rows: filled, fps: 1 / step };
+  return { rows: filled, fps };
 }
 
 function between(a: Row, b: Row, share: number): Row {

@@ -2,13 +2,13 @@
 
 import { AvatarError } from "./format";
 import { axisAngle, multiplied, rotationMatrix } from "./rigid";
-import type { Row, Series } from "./series";
+import { median, type Row, type Series } from "./series";
 
 const DAY = 86_400, RATES = [24, 25, 30, 48, 50, 60, 90, 120, 240];
 /** Columns of times in the file's own clock, and their units in a second. Frame numbers are taken for 30 a second. */
 const UNITS: Record<string, number> = { timestamp_ms: 1000, timestampms: 1000, time: 1, frame: 30 };
-/** Largest yaw and pitch that a camera sees, in radians. */
-const MAX_TURN = 1.7;
+/** Largest yaw and pitch that a camera sees, in radians, and largest speed of a head in radians a second. */
+const MAX_TURN = 1.7, MAX_SPEED = 20;
 /** Slides have the observer's sides in this file. The table is in docs/conventions.md. */
 const PERFORMERS: Record<string, string> = { jawleft: "jawright", jawright: "jawleft", mouthleft: "mouthright", mouthright: "mouthleft" };
 
@@ -34,9 +34,21 @@ export function readCsv(text: string, notes: string[]): Series {
     rows.push(cells[header.indexOf("blendshapecount")]?.trim() === "0" ? null : rowOf(header, cells, number, clock ? {} : PERFORMERS));
   }
   if (!rows.some((row) => row)) throw new AvatarError("has no row with a face");
-  if (clock) return { rows, seconds: whole, slack: 0 };
+  if (clock) return checked({ rows, seconds: whole, slack: 0 });
   const rate = whole.some((seconds) => seconds !== whole[0]) ? RATES.find((usual) => usual > most) ?? 1000 : 60;
-  return { rows, seconds: whole.map((seconds, i) => seconds + frames[i] / rate), slack: 1 / rate };
+  return checked({ rows, seconds: whole.map((seconds, i) => seconds + frames[i] / rate), slack: 1 / rate });
+}
+
+/** Refuses a head that turns faster than heads do, which is one whose angles are in degrees. */
+function checked(series: Series): Series {
+  const steps = series.seconds.slice(1).map((time, i) => time - series.seconds[i]), usual = median(steps.filter((step) => step > 0));
+  for (const name of ["headyaw", "headpitch", "headroll"])
+    steps.forEach((step, i) => {
+      const [from, to] = series.rows.slice(i, i + 2).map((row) => row?.scores.get(name)), turn = (to ?? NaN) - (from ?? NaN);
+      if (Math.abs(Math.atan2(Math.sin(turn), Math.cos(turn))) / Math.max(step, usual) > MAX_SPEED)
+        throw new AvatarError(`has ${to} for ${name} right after ${from}; angles are in radians, so divide degrees by 57.3`);
+    });
+  return series;
 }
 
 /** What splits a line into cells: at the commas, semicolons or tabs of the header, unless they are in quotes. */

@@ -1,5 +1,5 @@
 // Sets faces by names, and prints each as json: whether every name works, its expression and its joints.
-// tests/test_named_faces.py calls it:
+// tests/test_face_loading.py calls it:
 //   node named.mjs MIEN.JS AVATAR.mien FACES.json
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";

@@ -1,4 +1,4 @@
-// What @pixiv/three-vrm makes of a .vrm file, in a page; tests/test_other_engines.py bundles it with esbuild.
+// What @pixiv/three-vrm makes of a .vrm file, in a page; tests/test_glb_avatar.py bundles it with esbuild.
 import { VRMLoaderPlugin, VRMMetaLoaderPlugin } from "@pixiv/three-vrm";
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";

@@ -41,6 +41,9 @@ _MAX_CAST = 0.92
 blue in seven clips, and up to 0.77 and 0.67 in ten drawn people (docs/log.md)."""
 _MAX_NOISE = 0.025
 """Noise relative to the face's mean level from which a clip counts as noisy. Seven clips have up to 0.008."""
+_LEAST_TINT_CHANGE = 1.2
+"""Factor by which the skin's blue, relative to its red, changes over time from which the white balance counts as
+drifting. Ten clips have up to 1.12, also where the exposure changes by 2.4."""
 _LIGHT_RANGE = (5, 95)
 """Percentiles of the face's brightness over time that are compared, so that single frames do not count."""
 _NOISE_KERNEL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)
@@ -165,6 +168,8 @@ def quality_report(name: str, quality: FrameQuality, measured: Float[np.ndarray,
     is_noisy = noise > _MAX_NOISE * brightness
     changing = max(quality.brightness.T, key=light_change)
     change = light_change(changing)
+    # The rows of rigs are those of several cameras, each with its own colours.
+    tints = measured[:, -1] / np.maximum(measured[:, -3], 1e-3) if quality.brightness.shape[1] == 1 else np.ones(1)
     hints = _hints(
         brightness if is_dark else None,
         clipped if is_overexposed else None,
@@ -172,6 +177,7 @@ def quality_report(name: str, quality: FrameQuality, measured: Float[np.ndarray,
         color,
         noise if is_noisy else None,
         changing if is_light_changing(changing) else None,
+        tints if light_change(tints) > _LEAST_TINT_CHANGE else None,
     )
     for hint in hints:
         say(f"warning: {name}: {hint}")
@@ -184,6 +190,7 @@ def quality_report(name: str, quality: FrameQuality, measured: Float[np.ndarray,
         "blurred_frames": blurred,
         "face_brightness": round(brightness, 4),
         "face_brightness_change": round(change, 3),
+        "skin_tint_change": round(light_change(tints), 3),
         "face_noise": round(noise, 4),
         "face_clipped": round(clipped, 4),
         "skin_color": [round(float(level), 4) for level in color],
@@ -216,11 +223,12 @@ def _hints(
     color: Float[np.ndarray, " 3"],
     noise: float | None,
     changing: Float[np.ndarray, " t"] | None,
+    drifting: Float[np.ndarray, " t"] | None,
 ) -> list[str]:
     """Return a line with a remedy for each fault.
 
-    The faults are a dark face's level, an over-exposed face's white part, a cast, the noise, and the brightness of each
-    frame where it changes.
+    The faults are a dark face's level, an over-exposed face's white part, a cast, the noise, and for each frame the
+    brightness where it changes and the ratio of blue to red where that drifts.
     """
     hints = []
     if dark is not None:
@@ -252,5 +260,12 @@ def _hints(
             f"{changing[darkest]:.0%} in frame {darkest}, {changing[brightest]:.0%} in frame {brightest}); training "
             "evens it out with a gain for each frame, which is less good than steady light; record the video again "
             "with the camera's exposure and white balance locked"
+        )
+    if drifting is not None:
+        least, most = int(np.nanargmin(drifting)), int(np.nanargmax(drifting))
+        hints.append(
+            f"the white balance drifts: the skin's blue is {drifting[least]:.0%} of its red in frame {least}, and "
+            f"{drifting[most]:.0%} in frame {most}; add --training.light changing to the training, which learns a gain "
+            "for each frame, or record the video again with the camera's white balance locked"
         )
     return hints

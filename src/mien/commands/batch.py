@@ -205,7 +205,12 @@ class Command:
         from mien.disk.files import write_atomically
 
         columns = [column.strip() for column in self.columns.split(",") if column.strip()]
-        table = means_by(result_rows(batch), self.rows, columns)
+        rows, folder = result_rows(batch), shlex.quote(str(batch.root))
+        if not any(row.get("method") for row in rows):
+            raise UserError(
+                f"{batch.root}: no row is done yet, so there is nothing to show; see `mien batch status {folder}`"
+            )
+        table = means_by(rows, self.rows, columns)
         for name, text in (("table.md", markdown_table(table)), ("table.tex", latex_table(table))):
             write_atomically(batch.root / name, lambda aside, text=text: aside.write_text(text, encoding="utf-8"))
         show(json.dumps(table) if self.as_json else markdown_table(table).rstrip())

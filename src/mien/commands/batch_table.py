@@ -194,12 +194,12 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str], usual
     _check(steps, where, kinds)
     files = [Path(word) for words in (inputs, *options.values()) for word in words if not is_url(word)]
     row = Row(name, tuple(map(tuple, steps)), labels, _memory(cells, inputs, where))
-    return with_fingerprint(row, [path for path in files if path.exists()])
+    return with_fingerprint(row, [path for path in files if _exists(path)])
 
 
 def _from_here(name: str, words: Sequence[str]) -> list[str]:
     """The words of an option that was typed: paths are relative to the current folder, not to the table."""
-    return [str(Path(word).resolve()) if name in _PATHS and Path(word).exists() else word for word in words]
+    return [str(Path(word).resolve()) if name in _PATHS and _exists(Path(word)) else word for word in words]
 
 
 def _column(name: str) -> str:
@@ -240,7 +240,15 @@ def _check_words(words: Iterable[str], name: str, where: str) -> None:
 
 def _must_exist(folder: Path, key: str, word: str) -> bool:
     """Whether a path has to exist. A face model may be a name instead."""
-    return key != "face-model" or (folder / word).exists()
+    return key != "face-model" or _exists(folder / word)
+
+
+def _exists(path: Path) -> bool:
+    """Whether there is such a file or folder. A name that no file can have is none."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def _check_twice(words: Sequence[str], where: str, complaint: str) -> None:
@@ -266,7 +274,7 @@ def _input(folder: Path, word: str, where: str) -> str:
     if is_url(word):
         return word
     path = folder / word
-    if not path.exists():
+    if not _exists(path):
         raise UserError(f"{where}: {path}: no such file; correct the table (paths are relative to it)")
     return str(path.resolve())
 

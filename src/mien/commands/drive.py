@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from mien.capture.settings import CaptureSettings
 from mien.commands.parsing.options import check_avatar, check_port, check_viewer, has_viewer
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
@@ -51,6 +52,7 @@ class Command:
     port: int = 0
     """Port of the viewer, from 1 to 65535. 0 means a free one."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
@@ -67,7 +69,7 @@ class Command:
         else:
             # The number of frames is known only after tracking, but a video or numbered pictures take any number.
             self.picture.plan(self.out, 2)
-        check_driver(Path(self.by), self.sequence, self.fps)
+        check_driver(Path(self.by), self.sequence, self.fps, self.capture)
         check_neutral(self.neutral)
 
     def _check_viewer(self) -> None:
@@ -86,6 +88,8 @@ class Command:
         for name, given in (("--sequence", self.sequence), ("--fps", self.fps), ("--neutral", self.neutral)):
             if given is not None:
                 raise UserError(f"{name} {given}: is for recordings, and --by is a camera; leave it out")
+        if self.capture != CaptureSettings():
+            raise UserError("--capture: is for a video or pictures, and --by is a camera; leave its options out")
         camera_named(self.by, self.camera_format)
         check_port(self.port)
         if self.out is None:
@@ -105,13 +109,14 @@ class Command:
             return
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        options = DriveOptions(self.sequence, self.head_pose, self.alone, self.fps, self.unlimited, self.neutral)
+        how = self.head_pose, self.alone, self.fps, self.unlimited, self.neutral, self.capture
+        options = DriveOptions(self.sequence, *how)
         run_driving_stage(run_dir, Path(self.by), self.out, options, self.picture)
 
     def _show(self) -> None:
         from mien.pipeline.view import Motions, Place, run_viewing_stage
 
-        motions = Motions(self.by, self.neutral, at_once=True)
+        motions = Motions(self.by, self.neutral, at_once=True, capture=self.capture)
         run_viewing_stage(self.workspace, self.run_name, motions, Place("127.0.0.1", self.port))
 
     def _follow(self) -> None:

@@ -31,33 +31,49 @@ def text_of(content: bytes) -> str:
 def table_rows(file: IO[bytes] | io.BytesIO) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a csv that are not empty, each with the number of its last line. The first is the heading.
 
-    Commas, semicolons or tabs separate cells, as in the heading. Excel's hint before it ("sep=;") is no row.
-
     Args:
-        file: the csv, in an encoding that `text_of` knows.
+        file: the csv, as for `split_lines`.
 
     Raises:
         ValueError: it is no text, or has lines or cells that would take too much memory.
         csv.Error: it is no csv.
     """
-    encoding = json.detect_encoding(file.read(4))
-    file.seek(0)
     taken = 0
+    for number, row in split_lines(file):
+        if not any(cell.strip() for cell in row):
+            continue
+        # Texts of one character take no memory of their own.
+        taken += len(row) * (_CELL_BYTES if sum(map(len, row)) > len(row) else _SHORT_CELL_BYTES)
+        if taken > MAX_CELLS_BYTES:
+            raise ValueError("it has too many values; cut it into shorter tables")
+        yield number, row
+
+
+def split_lines(file: IO[bytes] | io.BytesIO, most: int = _MAX_LINE) -> Iterator[tuple[int, list[str]]]:
+    """Yield all rows of a csv, also empty ones, each with the number of its last line, and close the file.
+
+    Commas, semicolons or tabs separate cells, as in the first line. Excel's hint before it ("sep=;") is no row.
+
+    Args:
+        file: the csv, in an encoding that `text_of` knows.
+        most: most characters of a line.
+
+    Raises:
+        ValueError: it is no text, or a line is longer.
+        csv.Error: it is no csv.
+    """
+    encoding, begun = json.detect_encoding(file.read(4)), False
+    file.seek(0)
     try:
         with io.TextIOWrapper(file, encoding=encoding, newline="") as text:
-            heading = next(
-                (line for line in iter(lambda: text.readline(_MAX_HEADING), "") if not _is_skipped(line)), ""
-            )
+            lines = iter(lambda: text.readline(_MAX_HEADING), "")
+            heading = next((line for line in lines if line.strip() and not _is_hint(line)), "")
             text.seek(0)
-            reader = csv.reader(short_lines(text, _MAX_LINE), delimiter=max(",;\t", key=heading.count))
+            reader = csv.reader(short_lines(text, most), delimiter=max(",;\t", key=heading.count))
             for row in reader:
-                if not any(cell.strip() for cell in row) or (not taken and _is_skipped(row[0])):
-                    continue
-                # Texts of one character take no memory of their own.
-                taken += len(row) * (_CELL_BYTES if sum(map(len, row)) > len(row) else _SHORT_CELL_BYTES)
-                if taken > MAX_CELLS_BYTES:
-                    raise ValueError("it has too many values; cut it into shorter tables")
-                yield reader.line_num, row
+                if begun or not row or not _is_hint(row[0]):
+                    yield reader.line_num, row
+                begun = begun or bool(row)
     except UnicodeDecodeError:
         raise ValueError(_NO_TEXT) from None
 
@@ -70,7 +86,6 @@ def with_point(number: str) -> str:
 _NO_TEXT = "it is no text in UTF-8 or UTF-16; save it as UTF-8"
 
 
-def _is_skipped(line: str) -> bool:
-    """Whether a line before the heading is empty, or Excel's hint."""
-    text = line.strip('\ufeff \t\r\n"').lower()
-    return not text or text.startswith("sep=")
+def _is_hint(line: str) -> bool:
+    """Whether a line before the heading is Excel's hint."""
+    return line.strip('\ufeff \t\r\n"').lower().startswith("sep=")

@@ -7,6 +7,7 @@ which describes the headers, the order of the columns and their bits.
 
 import gzip
 import io
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -63,7 +64,7 @@ def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> 
     assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
     means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
     reach = float(np.abs(means).max(initial=0))
-    fraction = min(_MAX_FRACTION, _FIXED_BITS - 1 - int(np.ceil(np.log2(max(reach, 1e-6)))))
+    fraction = min(_MAX_FRACTION, math.floor(math.log2((2**_FIXED_BITS - 1) / max(reach, 1e-6))))
     if fraction < 0:
         raise UserError(f"{path}: a Gaussian is {reach:.3g} m away, too far for .spz; write a .ply")
     fixed = np.round(means.astype(np.float64) * 2**fraction).astype("<i4")

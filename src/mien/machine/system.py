@@ -1,6 +1,6 @@
 """What Linux, macOS and Windows do differently: flags of open files, locks, processes, signals and memory.
 
-No other module of mien asks for something that one of these systems lacks; `tests/test_places.py` checks that.
+No other module of mien asks for something that one of these systems lacks; `tests/test_terminal.py` checks that.
 docs/platforms.md lists what was run on which system.
 """
 

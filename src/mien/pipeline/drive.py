@@ -1,5 +1,6 @@
 """From an avatar and a motion to pictures, as the command line runs it."""
 
+import hashlib
 import itertools
 from dataclasses import dataclass
 from functools import partial
@@ -36,7 +37,12 @@ from mien.training.run import filmed_range, run_camera
 
 
 def open_driver(
-    by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None, neutral: str | None = None
+    by: Path,
+    sequence: str | None,
+    face_model: FaceModel,
+    fps: float | None = None,
+    neutral: str | None = None,
+    capture: CaptureSettings | None = None,
 ) -> Driver:
     """Open a driver: a workspace, a recording (csv, json, voice), or a film.
 
@@ -48,10 +54,11 @@ def open_driver(
         face_model: The avatar's face model.
         fps: Frame rate of the timecode in a csv.
         neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.with_neutral`).
+        capture: How a film is captured.
     """
-    check_driver(by, sequence, fps)
+    check_driver(by, sequence, fps, capture)
     check_neutral(neutral)
-    driver = _open(by, sequence, face_model, fps)
+    driver = _open(by, sequence, face_model, fps, capture)
     if neutral is None and by.is_file() and _is_film(by) and is_picture(by):
         say(f"{by}: is one picture, so its motion is measured from the face model's neutral")
         neutral = "model"
@@ -63,11 +70,17 @@ def _is_film(by: Path) -> bool:
     return by.suffix.lower() not in (".csv", ".json", *SOUND_ENDINGS)
 
 
-def _open(by: Path, sequence: str | None, face_model: FaceModel, fps: float | None = None) -> Driver:
+def _open(
+    by: Path,
+    sequence: str | None,
+    face_model: FaceModel,
+    fps: float | None = None,
+    capture: CaptureSettings | None = None,
+) -> Driver:
     if by.is_file() and not _is_film(by):
         return read_recording(by, face_model, fps)
     if by.is_file() or holds_pictures(by):
-        workspace, names = tracked_film(by, face_model.name)
+        workspace, names = tracked_film(by, face_model.name, capture)
         names = names if sequence is None else [workspace.pick_sequence(sequence)]
     elif is_tracked_sequence(by):
         return read_tracked_driver([by], face_model)
@@ -85,13 +98,18 @@ def _write(content: bytes, path: Path) -> None:
     path.write_bytes(content)
 
 
-def tracked_film(film: Path, face_model_name: str) -> tuple[Workspace, list[str]]:
+def tracked_film(
+    film: Path, face_model_name: str, capture: CaptureSettings | None = None
+) -> tuple[Workspace, list[str]]:
     """The workspace of a video, a picture or a folder of pictures in this user's cache, and its sequences.
 
-    They are captured and tracked if needed.
+    They are captured and tracked if needed. Each way to capture them has a workspace of its own.
     """
+    settings = capture or CaptureSettings()
     pictures = list_images(film) if film.is_dir() else [film] if is_picture(film) else []
     digest = open_source(film, FrameSelection(), 1.0).content_hash if film.is_dir() else file_digest(film)
+    if settings != CaptureSettings():
+        digest = hashlib.sha256(f"{digest} {settings}".encode()).hexdigest()
     workspace = Workspace(cache_folder() / "drivers" / f"{film.resolve().stem}-{digest[:12]}")
     source = film
     if 0 < len(pictures) < _FEWEST:
@@ -99,7 +117,7 @@ def tracked_film(film: Path, face_model_name: str) -> tuple[Workspace, list[str]
         for index, picture in enumerate(each for each in pictures for _ in range(_FEWEST)):
             content = picture.read_bytes()
             write_atomically(source / f"{index}{picture.suffix}", partial(_write, content))
-    run_capture_stage(workspace, source, None, CaptureSettings())
+    run_capture_stage(workspace, source, None, settings)
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
     tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
     names = sorted(tracked, key=lambda name: (len(name), name))
@@ -122,6 +140,8 @@ class DriveOptions:
     """Whether the avatar follows also beyond what was filmed."""
     neutral: str | None = None
     """The driver's face at rest, as `--neutral` names it."""
+    capture: CaptureSettings | None = None
+    """How a driver that is filmed is captured."""
 
 
 def run_driving_stage(
@@ -133,7 +153,7 @@ def run_driving_stage(
     output = picture.plan(out, 2)
     avatar = load_avatar(run_dir)
     warn_of_white(picture, run_dir, avatar)
-    driver = open_driver(by, options.sequence, avatar.face_model, options.fps, options.neutral)
+    driver = open_driver(by, options.sequence, avatar.face_model, options.fps, options.neutral, options.capture)
     bounds, filmed_by = avatar.face_model.expression_bounds, run_camera(run_dir)
     person = rest_of(avatar.subject, avatar.face_model, facing(filmed_by.viewmat)).face
     driven = drive(driver.face, driver.at_rest, person, bounds, options.head_pose, str(by))

@@ -1,7 +1,9 @@
 """What drives an avatar, as people name it, and what is wrong with it before anything is opened."""
 
+from dataclasses import fields
 from pathlib import Path
 
+from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import is_workspace, open_workspace
 from mien.errors import UserError
 from mien.media.sound import SOUND_ENDINGS
@@ -34,7 +36,9 @@ def check_neutral(neutral: str | None) -> None:
         check_driver(Path(neutral), None)
 
 
-def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> None:
+def check_driver(
+    by: Path, sequence: str | None, fps: float | None = None, capture: CaptureSettings | None = None
+) -> None:
     """Check before any work that the driver exists: a workspace with that sequence, or a file."""
     suffix = by.suffix.lower() if by.is_file() else ""
     if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
@@ -43,10 +47,18 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
         raise UserError(f"{by}: no such file or folder; give {_DRIVERS}")
     if suffix in (".csv", ".json", *SOUND_ENDINGS) and sequence is not None:
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
-    if not by.is_file():
-        if not holds_pictures(by):
-            open_workspace(by).pick_sequence(sequence)
-    elif suffix not in (".csv", ".json", *SOUND_ENDINGS):
+    is_film = holds_pictures(by) or (by.is_file() and suffix not in (".csv", ".json", *SOUND_ENDINGS))
+    settings, usual = capture or CaptureSettings(), CaptureSettings()
+    for name in () if is_film else (one.name for one in fields(settings)):
+        value = getattr(settings, name)
+        if value != getattr(usual, name):
+            option = f"--capture.{'no-' * (value is False)}{name.replace('_', '-')}"
+            typed = option if value is False else f"{option} {value}"
+            raise UserError(f"{typed}: is for a video or pictures, and --by is {by}; leave {option} out")
+    settings.check()
+    if not by.is_file() and not is_film:
+        open_workspace(by).pick_sequence(sequence)
+    elif by.is_file() and is_film:
         from mien.media.video_file import open_video
 
         try:
@@ -54,6 +66,8 @@ def check_driver(by: Path, sequence: str | None, fps: float | None = None) -> No
                 pass
         except UserError as error:
             raise UserError(f"{error}; what drives an avatar is {_DRIVERS}") from None
+        with open_video(by, settings.stream):
+            pass
 
 
 def holds_pictures(folder: Path) -> bool:

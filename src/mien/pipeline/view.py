@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien import runtime
+from mien.capture.settings import CaptureSettings
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.stops import Terminated
@@ -65,6 +66,8 @@ class Motions:
     """The face at rest of all motions, as `--neutral` names it."""
     at_once: bool = False
     """Whether the motion plays as soon as the viewer opens."""
+    capture: CaptureSettings | None = None
+    """How `play` is captured if it is filmed."""
 
 
 def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Place, follow: bool = False) -> None:
@@ -98,7 +101,7 @@ def _session(viewed: Viewed, motions: Motions) -> Session:
 
         clips = {name: clip_of(viewed, folder, name, motions.neutral) for name, folder in viewed.sequences.items()}
         if motions.play is not None:
-            clips[Path(motions.play).name] = clip_of(viewed, Path(motions.play), None, motions.neutral)
+            clips[Path(motions.play).name] = clip_of(viewed, Path(motions.play), None, motions.neutral, motions.capture)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
     if motions.play is not None and motions.at_once:
         session.choose(Path(motions.play).name)

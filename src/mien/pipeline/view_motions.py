@@ -10,6 +10,7 @@ import torch
 from mien import runtime
 from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import load_avatar
+from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.driving.keeping import keep_to_filmed
 from mien.driving.live.follower import Follower, FollowOptions
@@ -64,12 +65,18 @@ def person_of(path: Path, portable: PortableAvatar) -> tuple[FaceModel, FacePara
     return model, replace(model.neutral(), **given)
 
 
-def clip_of(viewed: Viewed, by: Path, sequence: str | None, neutral: str | None = None) -> Callable[[], Clip]:
+def clip_of(
+    viewed: Viewed,
+    by: Path,
+    sequence: str | None,
+    neutral: str | None = None,
+    capture: CaptureSettings | None = None,
+) -> Callable[[], Clip]:
     """Return a function that loads a motion, made for the avatar and softly within what was filmed."""
 
     def load() -> Clip:
         model, subject = viewed.person()
-        driver, portable = open_driver(by, sequence, model, neutral=neutral), viewed.portable
+        driver, portable = open_driver(by, sequence, model, None, neutral, capture), viewed.portable
         person = rest_of(subject, model, facing(torch.from_numpy(portable.camera.viewmat))).face
         face = drive(driver.face, driver.at_rest, person, model.expression_bounds, True, str(by))
         if portable.filmed is not None:

@@ -3,7 +3,7 @@
 Tracking fits a face model that has one texture. A trained avatar knows the person better: hair, ears, teeth, glasses.
 So a quick avatar, the template, is trained on the training frames. Then the face parameters of each frame move until
 the template, which stays as it is, looks like the picture. This is tracking: a held-out frame is looked at for its own
-face parameters, as in every fit to pixels, and reaches no avatar.
+face parameters, as in every fit to pixels, and reaches no avatar and no face of another frame.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar, ParameterGroup, frozen, move_avatar
@@ -126,19 +126,28 @@ def align(
     aligned = align_faces(
         template, sequences, starts, known, settings, training.held_out_cameras, folder, progress, gains
     )
-    return [steadier(sequence.tracking.face, face) for sequence, face in zip(sequences, aligned, strict=True)]
+    tracked = [sequence.tracking.face for sequence in sequences]
+    return [steadier(*each) for each in zip(tracked, aligned, _trained(known, lengths), strict=True)]
 
 
-def steadier(tracked: FaceParams, aligned: FaceParams) -> FaceParams:
+def steadier(tracked: FaceParams, aligned: FaceParams, trained: Bool[Tensor, " t"]) -> FaceParams:
     """The aligned face parameters of a sequence, with corrections of the head's pose that are averaged over time.
 
     Each frame is aligned on its own, which makes heads tremble. A tracking's errors change slowly, so its corrections
     are averaged over three timesteps. Expressions stay, since averaging them costs detail.
+
+    Args:
+        tracked: The face parameters as they were tracked.
+        aligned: The same, aligned.
+        trained: The timesteps that training uses. They take nothing from others, so that no held-out frame moves them.
     """
-    corrections = pose_corrections(tracked, aligned)
-    padded = torch.cat([corrections[:1], corrections, corrections[-1:]])
-    corrections = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
-    poses = corrected_poses(tracked, corrections)
+    own, places = pose_corrections(tracked, aligned), torch.arange(len(aligned))
+
+    def beside(step: int) -> Float[Tensor, "t 6"]:
+        others = (places + step).clamp(0, len(places) - 1)
+        return own[torch.where(trained[others] | ~trained, others, places)]
+
+    poses = corrected_poses(tracked, (beside(-1) + 2 * own + beside(1)) / 4)
     return replace(aligned, head_rotation=poses.head_rotation, head_translation=poses.head_translation)
 
 
@@ -162,7 +171,8 @@ def align_faces(
         avatar: The avatar, on the CPU. It is the same afterwards.
         sequences: The sequences.
         starts: The face parameters of each sequence to start from.
-        known: The frames that the avatar was trained on. Some of them say how large gradients are.
+        known: The frames that the avatar was trained on. Some of them say how large gradients are, and they alone say
+            what corrections of head poses share.
         settings: Settings of the descent.
         held_out_cameras: Ids of cameras that are not looked at.
         folder: Where timesteps that are aligned are kept, for this call and no other. A stopped call continues there.
@@ -171,7 +181,8 @@ def align_faces(
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
     tuning, bounds = _tuning(settings, single), avatar.face_model.expression_bounds
-    track = FaceTrack(concatenate(list(starts)), tuning, lengths, bounds)
+    used = torch.cat(_trained(known, lengths)).nonzero()[:, 0].tolist()
+    track = FaceTrack(concatenate(list(starts)), tuning, lengths, bounds, trained=used)
     targets = [Targets(sequence, settings.resolution, len(sequences), cleaned=True) for sequence in sequences]
     timesteps = [one for index, own in enumerate(sequences) for one in _looked_at(index, own, held_out_cameras)]
     trained = {frame[:2] for frame in known}
@@ -346,6 +357,14 @@ def _looked_at(index: int, sequence: Sequence, held_out_cameras: Items[str]) -> 
         cameras = np.flatnonzero(usable[timestep]).tolist()
         if cameras:
             yield index, timestep, tuple(cameras)
+
+
+def _trained(known: Items[Frame], lengths: list[int]) -> list[Bool[Tensor, " t"]]:
+    """Which timesteps of each sequence have a frame that the avatar was trained on."""
+    found = [torch.zeros(length, dtype=torch.bool) for length in lengths]
+    for frame in known:
+        found[frame.sequence][frame.timestep] = True
+    return found
 
 
 def _split(faces: FaceParams, lengths: Items[int]) -> list[FaceParams]:

@@ -100,17 +100,19 @@ class FaceTrack:
 
         That is their mean over all timesteps that were tuned, and what is linear in the head's turns. Only the sum of
         Gaussians and poses shows in the pictures of one camera, so both could move together, and a head that is too
-        deep could turn less.
+        deep could turn less. Timesteps that training does not use lose the same, but decide nothing of it.
         """
         tuning, seen = self._tuning, self._seen()
         if not (tuning.enabled and (tuning.keep_mean_pose or tuning.keep_turns) and bool(seen.any())):
             return
         start, now = self._start[seen], replace(self._start, **self._fields)[seen]
         corrections = pose_corrections(start, now)
+        trained = torch.zeros_like(seen).index_fill(0, torch.tensor(self._trained, dtype=torch.long), True)[seen]
+        known = trained if bool(trained.any()) else torch.ones_like(trained)
         if tuning.keep_turns:
-            corrections = without_turns(corrections, self._away[seen], self._sequence[seen])
+            corrections = without_turns(corrections, self._away[seen], self._sequence[seen], known)
         if tuning.keep_mean_pose:
-            corrections = corrections - corrections.mean(0)
+            corrections = corrections - corrections[known].mean(0)
         steady = corrected_poses(start, corrections)
         self._fields["head_rotation"][seen] = steady.head_rotation
         self._fields["head_translation"][seen] = steady.head_translation
@@ -219,7 +221,10 @@ def turns_from_mean(tracked: FaceParams, trained: Items[int] | None = None) -> F
 
 
 def without_turns(
-    corrections: Float[Tensor, "t c"], away: Float[Tensor, "t 3"], sequence: Int[Tensor, " t"]
+    corrections: Float[Tensor, "t c"],
+    away: Float[Tensor, "t 3"],
+    sequence: Int[Tensor, " t"],
+    known: Bool[Tensor, " t"] | None = None,
 ) -> Float[Tensor, "t c"]:
     """Corrections without the part that is linear in the head's turns. Their mean stays.
 
@@ -230,13 +235,16 @@ def without_turns(
         corrections: The corrections, on any device.
         away: `turns_from_mean` of the same timesteps, on the CPU, so that nothing here waits for a GPU.
         sequence: Index of each timestep's sequence, on the CPU.
+        known: Which timesteps decide how corrections follow turns, on the CPU. Default: all.
     """
-    within = away.clone()
-    for index in sequence.unique():
-        within[sequence == index] -= away[sequence == index].mean(0)
-    doubt = len(away) * _STILL_TURNS**2 * torch.eye(3).to(away)
+    known = torch.ones(len(away), dtype=torch.bool) if known is None else known
+    within, places = away[known], sequence[known]
+    for index in places.unique():
+        within[places == index] -= within[places == index].mean(0)
+    doubt = len(within) * _STILL_TURNS**2 * torch.eye(3).to(away)
     slopes_of = torch.linalg.solve(within.T @ within + doubt, within.T)
-    return corrections - (away - away.mean(0)).to(corrections) @ (slopes_of.to(corrections) @ corrections)
+    slopes = slopes_of.to(corrections) @ corrections[known]
+    return corrections - (away - away[known].mean(0)).to(corrections) @ slopes
 
 
 def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:

@@ -130,10 +130,11 @@ def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]
         lengths: Number of timesteps of each sequence.
     """
     path = run_dir / GAINS
-    if not path.exists():
+    if not path.exists() and not path.is_symlink():
         return []
     gains = read_tensors(path).get("gains", torch.zeros(0))
-    if gains.shape != (sum(lengths), 3) or not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
+    is_whole = gains.shape == (sum(lengths), 3) and gains.dtype in (torch.float32, torch.float64)
+    if not is_whole or not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
         raise UserError(f"{path}: does not hold gains of {sum(lengths)} timesteps; train again")
     return list(gains.float().split(list(lengths)))
 

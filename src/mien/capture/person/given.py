@@ -1,7 +1,6 @@
 """Step 1: read the clean plate, mattes and landmarks that the user gives, and check them against their source."""
 
 import csv
-import io
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,8 @@ from mien.capture.person.faces import LANDMARKS
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import read_arrays
 from mien.disk.limits import MAX_NUMBER
-from mien.disk.reading import open_ordinary, short_lines
+from mien.disk.reading import open_ordinary
+from mien.disk.tables import split_lines, with_point
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.terminal import counted
@@ -196,16 +196,15 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
     """
     rows: list[np.ndarray] = []
     try:
-        with io.TextIOWrapper(open_ordinary(path), encoding="utf-8", newline="") as file:
-            for number, line in enumerate(csv.reader(short_lines(file, _MAX_LINE)), 1):
-                if number == 1 and any(_is_name(cell) for cell in line):
-                    continue
-                if len(line) not in (0, 2 * LANDMARKS):
-                    raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
-                numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
-                rows.append(np.array(numbers))
-                if len(rows) > most:
-                    break
+        for index, (number, line) in enumerate(split_lines(open_ordinary(path), _MAX_LINE)):
+            if index == 0 and any(_is_name(cell) for cell in line):
+                continue
+            if len(line) not in (0, 2 * LANDMARKS):
+                raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
+            numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
+            rows.append(np.array(numbers))
+            if len(rows) > most:
+                break
     except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
     return np.array(rows).reshape(len(rows), LANDMARKS, 2)
@@ -217,7 +216,7 @@ def _is_name(cell: str) -> bool:
 
 def _number(path: Path, line: int, cell: str) -> float:
     try:
-        return float(cell) if cell.strip() else np.nan
+        return float(with_point(cell)) if cell.strip() else np.nan
     except ValueError:
         shown = repr(cell if len(cell) <= _MAX_SHOWN else f"{cell[:_MAX_SHOWN]}...")
         raise UserError(f"{path}: line {line}: {shown} is not a number; write pixels, or nan for no face") from None
