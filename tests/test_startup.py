@@ -159,11 +159,13 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_extras_bring_what_commands_need_and_the_base_install_asks_for_five_packages():
+def test_extras_bring_what_commands_need_and_the_base_install_asks_for_six_packages():
     missing = {module for module, extra in extras.EXTRA_OF.items() if extra not in ("create", "video")}
     assert "mien.pipeline.train" in python_without(missing, STAGES).split()
     asked = requirements_of(PROJECT)
-    assert {name for name, extra in asked.items() if not extra} == {"numpy", "safetensors", "jaxtyping", "tyro", "rich"}
+    assert {name for name, extra in asked.items() if not extra} == {
+        "numpy", "safetensors", "jaxtyping", "lazy-loader", "tyro", "rich"
+    }  # fmt: skip
     extra_of = {extras.PACKAGE_OF.get(module, module).lower(): extra for module, extra in extras.EXTRA_OF.items()}
     del extra_of["scipy"]  # comes with others of the extra
     assert {package: asked.get(package) for package in extra_of} == extra_of

@@ -16,6 +16,7 @@ _LICENCES = {
     "numpy": "BSD-3-Clause",
     "safetensors": "Apache-2.0",
     "jaxtyping": "MIT",
+    "lazy-loader": "BSD-3-Clause",
     "tyro": "MIT",
     "rich": "MIT",
     "torch": "BSD-3-Clause",
