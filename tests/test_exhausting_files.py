@@ -28,6 +28,7 @@ from mien.capture import given
 from mien.capture.crop import whole_picture
 from mien.capture.faces import LANDMARKS
 from mien.capture.given import GivenMattes, read_landmarks
+from mien.capture.source import FrameSelection, open_source
 from mien.cli import main
 from mien.driving import drive, motion, read_blendshape_json, read_live_link_face
 from mien.errors import UserError
@@ -237,6 +238,8 @@ def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     chunk = data.index(b"IDAT") - 4
     assert not png_fits(data[:chunk] + b"\xff\xff\xff\xf0" + data[chunk + 4 :]), "a decoder would allocate 4 GB"
     assert not png_fits(data[:-12])
+    with pytest.raises(UserError, match="0.png: has 1,073,741,824 bytes, and a picture may have at most 603,979,776"):
+        open_source(sparse(path, 1 << 30).parent, FrameSelection(), 25.0)
     path.write_bytes(b"\x89PNG\r\n\x1a\nIEND\xaeB`\x82")
     refuses(r"0\.png: damaged", decode_png, path, (8, 8), "capture again")
 

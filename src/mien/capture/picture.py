@@ -37,11 +37,7 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
         UserError: it has more pixels than `MAX_PICTURE_PIXELS`, or its file is larger than that of any such picture.
     """
     try:
-        size = path.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            raise UserError(
-                f"{path}: has {size:,} bytes, and a picture may have at most {_MAX_FILE_BYTES:,}; make it smaller"
-            )
+        check_file_size(path)
         data = path.read_bytes() if path.is_file() else b""
     except OSError:
         return None
@@ -58,6 +54,20 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         return None
+
+
+def check_file_size(path: Path) -> None:
+    """Check that a file is no larger than that of any picture, before it is read.
+
+    Raises:
+        UserError: it is.
+        OSError: it is missing.
+    """
+    size = path.stat().st_size
+    if size > _MAX_FILE_BYTES:
+        raise UserError(
+            f"{path}: has {size:,} bytes, and a picture may have at most {_MAX_FILE_BYTES:,}; make it smaller"
+        )
 
 
 def may_have_alpha(path: Path) -> bool:

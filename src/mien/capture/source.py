@@ -17,7 +17,7 @@ from mien.capture.alpha import as_matte, over_ground
 from mien.capture.color_correction import ColorCorrection
 from mien.capture.deinterlacing import Deinterlace
 from mien.capture.lens import Lens
-from mien.capture.picture import decode_picture, may_have_alpha
+from mien.capture.picture import check_file_size, decode_picture, may_have_alpha
 from mien.capture.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.capture.video_file import VIDEO_SUFFIXES
 from mien.errors import UserError
@@ -169,6 +169,8 @@ def open_source(
     if path.is_dir():
         images = list_images(path)
         total = len(images)
+        for image in images:
+            check_file_size(image)
         content_hash = _hash_files(images, with_names=True)
     else:
         info = probe_video(path, stream)
