@@ -44,6 +44,7 @@ from mien.formats.sog import read_sog, write_sog
 from mien.formats.usd import read_usd, write_usd
 from mien.gaussians import Gaussians
 from mien.media.picture_files import decode_png, png_fits
+from mien.media.source import FrameSelection, open_source
 from mien.runtime.checks import check
 from mien.training import train
 from recordings import row, write_csv, write_json
@@ -241,6 +242,8 @@ def test_pictures_that_are_too_few_or_not_whole(tmp_path: Path) -> None:
     chunk = data.index(b"IDAT") - 4
     assert not png_fits(data[:chunk] + b"\xff\xff\xff\xf0" + data[chunk + 4 :]), "a decoder would allocate 4 GB"
     assert not png_fits(data[:-12])
+    with pytest.raises(UserError, match="0.png: has 1,073,741,824 bytes, and a picture may have at most 603,979,776"):
+        open_source(sparse(path, 1 << 30).parent, FrameSelection(), 25.0)
     path.write_bytes(b"\x89PNG\r\n\x1a\nIEND\xaeB`\x82")
     refuses(r"0\.png: damaged", decode_png, path, (8, 8), "capture again")
 

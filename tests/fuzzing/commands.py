@@ -22,9 +22,9 @@ def read_film(root: Path, file: Path) -> FrameSource:
     for stream in (source.stream, *source.other_streams[:2]):
         source = open_source(file, FrameSelection(), 25.0, stream=stream)
         for frame in itertools.islice(source.frames(48), 3 * SEEN):
-            alpha, (width, height) = frame.alpha(), frame.size()
+            picture, alpha, (width, height) = frame.picture(), frame.alpha(), frame.size()
+            assert (picture.dtype, picture.ndim) == (np.uint8, 3)
             assert alpha is None or (alpha.dtype, alpha.shape) == (np.uint8, (height, width)), (alpha.shape, height)
-            assert (frame.picture().dtype, frame.picture().ndim) == (np.uint8, 3)
             assert np.isfinite((frame.seconds, frame.combs())).all()
     return source
 

@@ -33,11 +33,7 @@ _TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)
 def decode_picture(path: Path, flags: int) -> np.ndarray | None:
     """Decode a picture file with OpenCV's `flags`. None if it is no picture, or a damaged one."""
     try:
-        size = path.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            raise UserError(
-                f"{path}: has {size:,} bytes, and a picture may have at most {_MAX_FILE_BYTES:,}; make it smaller"
-            )
+        check_file_size(path)
         data = path.read_bytes() if path.is_file() else b""
     except OSError:
         return None
@@ -54,6 +50,20 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         return None
+
+
+def check_file_size(path: Path) -> None:
+    """Check that a file is no larger than that of any picture, before it is read.
+
+    Raises:
+        UserError: it is.
+        OSError: it is missing.
+    """
+    size = path.stat().st_size
+    if size > _MAX_FILE_BYTES:
+        raise UserError(
+            f"{path}: has {size:,} bytes, and a picture may have at most {_MAX_FILE_BYTES:,}; make it smaller"
+        )
 
 
 def may_have_alpha(path: Path) -> bool:

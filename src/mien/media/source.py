@@ -17,7 +17,7 @@ from mien.disk.inside import listed
 from mien.errors import UserError
 from mien.media.alpha import as_matte, over_ground
 from mien.media.color_correction import ColorCorrection
-from mien.media.decoding import decode_picture, may_have_alpha
+from mien.media.decoding import check_file_size, decode_picture, may_have_alpha
 from mien.media.fields import Deinterlace
 from mien.media.lens import Lens
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily
@@ -158,6 +158,8 @@ def open_source(
     if path.is_dir():
         images = list_images(path)
         total = len(images)
+        for image in images:
+            check_file_size(image)
         content_hash = _hash_files(images, with_names=True)
     else:
         info = probe_video(path, stream)
