@@ -189,8 +189,8 @@ def _end(code: object) -> None:
 
 
 if __name__ == "__main__":
-    for each in ("driving", "evaluating", "exporting", "pictures", "training"):
-        importlib.import_module(f"mien.commands.stages.{each}")
+    for each in ("drive", "evaluate", "export", "draw", "train"):
+        importlib.import_module(f"mien.pipeline.{each}")
     for each in ("mien.cli", "mien.avatar.gaussian_avatars.avatar", "tyro"):
         importlib.import_module(each)
     tempfile.tempdir = None

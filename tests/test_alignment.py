@@ -198,8 +198,8 @@ def test_a_template_of_another_device_aligns_on_the_processor(device: str, tmp_p
 
 @pytest.fixture
 def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for stage in ("training", "tracking"):
-        monkeypatch.setattr(f"mien.commands.stages.{stage}.load_face_model", lambda name: toy_face_model())
+    for stage in ("train", "track"):
+        monkeypatch.setattr(f"mien.pipeline.{stage}.load_face_model", lambda name: toy_face_model())
     write_toy_workspace(tmp_path / "W")
     # What shows a tracking needs landmarks, which toys have not.
     monkeypatch.setattr("mien.pipeline.track.show_tracking", lambda *given: None)
