@@ -16,7 +16,8 @@ from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
 from mien.capture.settings import CaptureSettings
 from mien.errors import UserError
-from mien.media.fields import Deinterlace, FieldOrder, combs, deinterlace
+from mien.media.choices import Deinterlace
+from mien.media.fields import FieldOrder, combs, deinterlace
 from mien.media.source import FrameSelection, open_source
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames, write_video
 

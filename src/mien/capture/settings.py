@@ -8,7 +8,7 @@ from typing import Literal
 from mien.capture.person.backend import DetectorChoice
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
-from mien.media.fields import Deinterlace
+from mien.media.choices import Deinterlace
 
 _MIN_SIZE = 32
 

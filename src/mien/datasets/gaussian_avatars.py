@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien.datasets.dataset import Dataset, TrainedAvatar
-from mien.formats.gaussian_avatars import read_gaussian_avatars_folder
 
 if TYPE_CHECKING:
     from mien.face.model import FaceModel
@@ -19,6 +18,8 @@ def _recognises(path: Path) -> str | None:
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> TrainedAvatar:
+    from mien.formats.gaussian_avatars import read_gaussian_avatars_folder
+
     content = read_gaussian_avatars_folder(path, face_model)
     return TrainedAvatar(content.avatar, content.face)
 

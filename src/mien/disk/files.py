@@ -1,6 +1,6 @@
-"""Files without torch: atomic writes, json with format and version, numpy arrays, and checks that a path is writable.
+"""Files: atomic writes, json with format and version, arrays and tensors, and checks that a path is writable.
 
-`mien.disk.files` adds torch tensors. Nothing here depends on what is stored.
+Nothing here depends on what is stored. torch is imported only for tensors.
 """
 
 import ctypes
@@ -14,44 +14,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import safetensors
 import safetensors.numpy
-import safetensors.torch
-from torch import Tensor
 
 from mien.disk.inside import open_new, remove_tree
 from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import CannotWriteError, UserError
 
-__all__ = [
-    "cannot_write",
-    "check_writable",
-    "expect_whole",
-    "file_digest",
-    "read_arrays",
-    "read_json",
-    "read_tensors",
-    "replace_folder",
-    "write_arrays",
-    "write_atomically",
-    "write_json",
-    "write_tensors",
-]
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write torch tensors as safetensors."""
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    write_safetensors(path, safetensors.torch.save(contiguous), metadata)
-
-
-def read_tensors(path: Path, stage: str = "the stage that writes it", remedy: str | None = None) -> dict[str, Tensor]:
-    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`."""
-    return read_safetensors(path, safetensors.torch.load_file, stage, remedy)
-
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _KEPT_OF_NAME = 100
 """Number of characters of a file's name that its temporary name keeps. File systems allow 255 bytes in all."""
@@ -308,3 +282,18 @@ def _tensor_checksum(header: Mapping[str, Any], body: Iterable[bytes | memoryvie
     for part in body:
         digest.update(part)
     return digest.hexdigest()
+
+
+def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping[str, str] | None = None) -> None:
+    """Write torch tensors as safetensors."""
+    import safetensors.torch
+
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_safetensors(path, safetensors.torch.save(contiguous), metadata)
+
+
+def read_tensors(path: Path, stage: str = "the stage that writes it", remedy: str | None = None) -> "dict[str, Tensor]":
+    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`."""
+    import safetensors.torch
+
+    return read_safetensors(path, safetensors.torch.load_file, stage, remedy)

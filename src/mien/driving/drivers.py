@@ -22,7 +22,7 @@ from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate, most_frontal_camera
 from mien.machine.progress import say
-from mien.media.sound import SOUND_ENDINGS
+from mien.media.choices import SOUND_ENDINGS
 from mien.training.footage.sequence import Sequence, read_sequence
 
 _TRACKED_REST = "the calmest tenth of its frames"

@@ -10,7 +10,7 @@ Frames that do not say that they are interlaced pass unchanged, bit by bit.
 from collections import deque
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import av
 import av.error
@@ -19,8 +19,7 @@ from av.filter import Graph
 from av.filter.context import FilterContext
 from jaxtyping import UInt8
 
-Deinterlace = Literal["auto", "always", "never"]
-
+from mien.media.choices import Deinterlace
 
 _TOP_FIRST, _BOTTOM_FIRST = (2, 4), (3, 5)
 """FFmpeg's codes of the order of fields. Programs use both codes of a pair alike."""

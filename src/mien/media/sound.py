@@ -15,9 +15,6 @@ from jaxtyping import Float32
 from mien.errors import UserError
 from mien.media.video_file import open_sound
 
-SOUND_ENDINGS = (".wav", ".mp3", ".flac", ".ogg", ".opus", ".m4a", ".aac", ".aif", ".aiff")
-
-
 RATE = 16_000
 """Samples a second of `read_sound`."""
 _MOST_SECONDS = 3600.0

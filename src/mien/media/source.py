@@ -16,9 +16,9 @@ from jaxtyping import UInt8
 from mien.disk.inside import listed
 from mien.errors import UserError
 from mien.media.alpha import as_matte, over_ground
+from mien.media.choices import Deinterlace
 from mien.media.color_correction import ColorCorrection
 from mien.media.decoding import check_file_size, decode_picture, may_have_alpha
-from mien.media.fields import Deinterlace
 from mien.media.lens import Lens
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily
 from mien.media.video_file import VIDEO_SUFFIXES

@@ -21,9 +21,10 @@ from jaxtyping import UInt8
 from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.machine.progress import say
+from mien.media.choices import Deinterlace
 from mien.media.colors import Colors, colors_of
 from mien.media.display import ACCURATE, Display, brought_to, has_shape
-from mien.media.fields import Deinterlace, FieldOrder, combs, deinterlace, no_combs
+from mien.media.fields import FieldOrder, combs, deinterlace, no_combs
 from mien.media.sound import add_sound
 from mien.media.video_file import TOO_MANY_PIXELS, create_video, find_streams, open_video, read_container_tags
 

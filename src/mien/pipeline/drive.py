@@ -21,9 +21,9 @@ from mien.driving.transfer import drive
 from mien.face.cache import cache_folder, cache_is_kept
 from mien.face.model import FaceModel
 from mien.machine.progress import say, track_progress
+from mien.media.choices import SOUND_ENDINGS
 from mien.media.output import plan_output
 from mien.media.pictures import side_by_side
-from mien.media.sound import SOUND_ENDINGS
 from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage

@@ -6,7 +6,7 @@ from pathlib import Path
 from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import is_workspace, open_workspace
 from mien.errors import UserError
-from mien.media.sound import SOUND_ENDINGS
+from mien.media.choices import SOUND_ENDINGS
 
 NEUTRALS = ("first", "calm", "model")
 """Words that --neutral takes. Anything else is a file."""
