@@ -61,7 +61,8 @@ def _sample(step: str, stages: dict[str, float], ended: threading.Event) -> None
 
 def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
     """The figures of a run as they come into the results: one value each. Writes the run's thumbnail as well."""
-    from mien.evaluation.metrics_file import METRICS, figure, read_figures
+    from mien.evaluation.metrics_file import figure, read_figures
+    from mien.pages.metric_names import METRICS
     from mien.training.run import read_run_config
 
     found: dict[str, Any] = {"run": run_dir.name, "method": read_run_config(run_dir)["method"]["kind"]}

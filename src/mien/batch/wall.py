@@ -6,8 +6,8 @@ from typing import Any
 from mien.batch.plan import Batch
 from mien.batch.results import DIGITS, HIGHER, paired
 from mien.disk.files import write_atomically
-from mien.evaluation.metrics_file import COLUMNS
 from mien.machine.terminal import counted
+from mien.pages.metric_names import COLUMNS
 from mien.pages.pages import LIVING_PAGE, render
 
 _HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}

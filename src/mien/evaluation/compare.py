@@ -8,13 +8,13 @@ from typing import Any
 from mien.errors import UserError
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
-    COLUMNS,
     FACE_SOURCE_NAMES,
     FITTED_NAME,
     OVER_DARK_NAME,
     figure,
     read_figures,
 )
+from mien.pages.metric_names import COLUMNS
 from mien.training.run import read_run_config
 
 

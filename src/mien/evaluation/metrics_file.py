@@ -9,14 +9,7 @@ from mien.disk.files import expect_whole, read_json
 from mien.disk.inside import is_one_line
 from mien.evaluation.experiment import Edges
 from mien.face.parts import PARTS
-
-METRICS = ("psnr", "ssim", "l1", "perceptual")
-COLUMNS = (
-    ("psnr", "PSNR, dB", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False),
-    ("perceptual", "ST-LPIPS", 3, False),
-)  # fmt: skip
-"""Metric, heading, number of digits, whether higher is better."""
-
+from mien.pages.metric_names import METRICS
 
 FORMAT, VERSION = "mien.metrics", 1
 _REMEDY = "delete this file, not its folder, and run `mien evaluate` again"

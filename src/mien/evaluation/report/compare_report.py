@@ -14,7 +14,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, head_box, targe
 from mien.evaluation.living import FILM
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import COLUMNS, PROTOCOL_NAMES, figure
+from mien.evaluation.metrics_file import PROTOCOL_NAMES, figure
 from mien.evaluation.report.page import (
     GLOSSARY,
     Card,
@@ -30,6 +30,7 @@ from mien.evaluation.report.report_sections import frame_name
 from mien.machine.progress import track_progress
 from mien.media.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
 from mien.media.video import read_video_frames
+from mien.pages.metric_names import COLUMNS
 from mien.pages.pages import render
 from mien.pages.plots import Axes, Series, line_chart
 from mien.training.footage.frames import Frame

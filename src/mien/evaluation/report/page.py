@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from mien.evaluation.metrics_file import COLUMNS
 from mien.media.pictures import data_uri, picture_uri, shrink
+from mien.pages.metric_names import COLUMNS
 
 GLOSSARY = {
     "Held-out frames": (

@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mien.evaluation.compare import Comparison, Row, Table
-from mien.evaluation.metrics_file import BASELINE_NAMES, COLUMNS, FACE_SOURCE_NAMES, FITTED_NAME, OVER_DARK_NAME, figure
+from mien.evaluation.metrics_file import BASELINE_NAMES, FACE_SOURCE_NAMES, FITTED_NAME, OVER_DARK_NAME, figure
 from mien.machine.terminal import printable
+from mien.pages.metric_names import COLUMNS
 
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 _FURTHER = {"opened": "eroded and dilated", "without_clothes": "the same without clothes"}

@@ -13,15 +13,7 @@ import numpy as np
 from mien.disk.files import write_atomically
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, Living
-from mien.evaluation.metrics_file import (
-    BASELINE_NAMES,
-    COLUMNS,
-    FITTED_NAME,
-    OVER_DARK_NAME,
-    PART_NAMES,
-    PROTOCOL_NAMES,
-    figure,
-)
+from mien.evaluation.metrics_file import BASELINE_NAMES, FITTED_NAME, OVER_DARK_NAME, PART_NAMES, PROTOCOL_NAMES, figure
 from mien.evaluation.protocols import Evaluation
 from mien.evaluation.report import report_sections as sections
 from mien.evaluation.report.page import (
@@ -35,6 +27,7 @@ from mien.evaluation.report.page import (
     metric_groups,
     metric_headings,
 )
+from mien.pages.metric_names import COLUMNS
 from mien.pages.pages import LIVING_PAGE, render
 from mien.training.footage.coverage import Coverage
 
