@@ -24,7 +24,7 @@ from mien.machine import progress, system
 from mien.machine.progress import Overall, Piece, progress_bar, say, whole_command
 from mien.machine.terminal import plain_name, printable, show
 from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
-from mien.pipeline.create import count_scored, expected_pieces
+from mien.pipeline.expected import count_scored, expected_pieces
 from mien.tracking.settings import TrackingSettings
 from mien.training import TrainSettings
 from needs import find_test_data

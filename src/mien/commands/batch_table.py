@@ -375,7 +375,7 @@ def _check(steps: list[list[str]], where: str, kinds: set[str]) -> None:
 
 def _memory(cells: dict[str, list[str]], inputs: list[str], where: str) -> float:
     """Megabytes that a row needs: as its column says, or from the number of its frames."""
-    from mien.pipeline.create import count_captured
+    from mien.pipeline.expected import count_captured
 
     if "memory-gb" in cells:
         try:

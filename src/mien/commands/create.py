@@ -117,7 +117,7 @@ class Command:
 
     def _overall(self, settings: TrainSettings) -> Overall:
         """What is to be done, with expected times."""
-        from mien.pipeline.create import count_captured, count_scored, expected_pieces
+        from mien.pipeline.expected import count_captured, count_scored, expected_pieces
         from mien.pipeline.names import sequence_names
 
         frames, names = [count_captured(video, self.capture) for video in self.videos], []
