@@ -23,7 +23,6 @@ from mien.avatar.methods import METHODS
 
 MAY_NAME = {
     "src/mien/avatar/methods.py": "the list of methods",
-    "src/mien/avatar/__init__.py": "the door: programs build avatars of a method they choose",
     "src/mien/avatar/point_avatar/avatar.py": "uses the deformation network that its successor took over",
     "src/mien/lab/analysis/registry.py": "the list of analyses, one for the paper of each method",
     "src/mien/lab/benchmarking/registry.py": "the list of benchmarks of training steps",
@@ -33,6 +32,7 @@ MAY_NAME = {
     "src/mien/lab/benchmarking/mono_step.py": "measures the step of one method",
     "src/mien/formats/registry.py": "the list of formats; one is named after the program whose files it reads",
     "src/mien/datasets/registry.py": "the list of datasets; one is named after the program whose files it reads",
+    "src/mien/datasets/gaussian_avatars.py": "reads the files of that method's own program",
     "src/mien/formats/gaussian_avatars.py": "the files of that method's own program become its avatars",
 }
 """Files that may name a method although they are not its own, and why."""

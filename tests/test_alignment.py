@@ -82,7 +82,7 @@ def test_faces_come_nearer_to_the_truth_and_the_avatar_stays() -> None:
 
 
 def test_what_was_stopped_goes_on_to_the_same_bytes(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("mien.training.alignment._ALIGNED_TOGETHER", 2)
+    monkeypatch.setattr("mien.training.alignment.ALIGNED_TOGETHER", 2)
     experiment = make_experiment(6)
     start, settings = astray(experiment.faces[0]), AlignmentSettings(resolution=32, iterations=2)
     begun: list[int] = []

@@ -132,7 +132,7 @@ def test_an_avatar_learns_follows_without_lag_and_goes_to_rest(clip: Path, landm
 @pytest.fixture
 def few_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the face at rest be learnt from a few frames, which takes half a second and not several."""
-    monkeypatch.setattr("mien.driving.live.follower._LEARN_LEAST_FRAMES", 2)
+    monkeypatch.setattr("mien.driving.live.follower.LEARN_LEAST_FRAMES", 2)
 
 
 @pytest.mark.unchecked

@@ -174,7 +174,7 @@ def test_what_is_beside_shown_triangles_is_trained(toy: Toy, monkeypatch: pytest
     monkeypatch.setattr("mien.training.whole_head.unseen.drawn_at_height", lambda *given: drawn)
 
     def filled(band: float) -> torch.Tensor:
-        monkeypatch.setattr("mien.training.whole_head.unseen._OUTLINE_BAND", band)
+        monkeypatch.setattr("mien.training.whole_head.unseen.OUTLINE_BAND", band)
         return known(measured(toy, avatar).prior.filled_in) & ~head_parts(model).interior
 
     every, behind = filled(0.0), filled(0.03)

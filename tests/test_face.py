@@ -211,7 +211,7 @@ DIRECTIONS = 4
 @pytest.fixture
 def points(monkeypatch):
     """Return a symmetric cloud whose vertex i mirrors onto i ^ 1."""
-    monkeypatch.setattr(anny_identity, "_ANNY_COMPONENTS", 2 * DIRECTIONS)
+    monkeypatch.setattr(anny_identity, "ANNY_COMPONENTS", 2 * DIRECTIONS)
     half = np.random.default_rng(0).normal(size=(20, 3)) * 0.05
     return np.stack([half, half * [-1, 1, 1]], axis=1).reshape(-1, 3)
 

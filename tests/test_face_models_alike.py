@@ -355,8 +355,8 @@ def test_a_head_of_gnm_gets_landmarks_and_regions_by_the_detector(tmp_path, monk
     # The usual 320 pictures of 512 pixels, and the search over all triangles in 16 of them, take minutes.
     monkeypatch.setattr(stage, "FIRST_PICTURES", 10)
     monkeypatch.setattr(stage, "EmbeddingSettings", partial(EmbeddingSettings, pictures=14, size=320))
-    monkeypatch.setattr(embedding, "_COARSE_VIEWS", 4)
-    monkeypatch.setattr(embedding, "_COARSE_SUBDIVISIONS", 1)
+    monkeypatch.setattr(embedding, "COARSE_VIEWS", 4)
+    monkeypatch.setattr(embedding, "COARSE_SUBDIVISIONS", 1)
     assert main(["face-models", "--add", str(path)]) == 0
     told = capsys.readouterr()
     assert "licence: Apache-2.0 (GNM Head)" in told.out

@@ -43,7 +43,7 @@ def absurd(sequence: Sequence) -> Sequence:
 @pytest.mark.parametrize("plain", [True, False], ids=["plain", "default"])
 @pytest.mark.parametrize("method", [*SMALL, "timesteps that are left out"])
 def test_held_out_frames_change_no_byte_of_an_avatar(method: str, plain: bool, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("mien.training.trainer._STEADY_EVERY", 2)
+    monkeypatch.setattr("mien.training.trainer.STEADY_EVERY", 2)
     face_model, sequence = toy_sequence(TIMESTEPS, 32)
     pair, settings = (sequence, absurd(sequence)), SETTINGS
     if method not in SMALL:

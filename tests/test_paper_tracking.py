@@ -159,7 +159,7 @@ def test_the_neck_has_no_column_of_its_own(case):
 @pytest.mark.unchecked
 def test_the_same_with_any_number_of_threads(monkeypatch):
     case = make_photometric_case(timesteps=5)
-    monkeypatch.setattr(epochs, "_MOST_BATCHES", 2)
+    monkeypatch.setattr(epochs, "MOST_BATCHES", 2)
     settings, runs = replace(ALONE, paper=replace(ALONE.paper, first_steps=10, steps=3, epochs=2)), []
     for threads in ("1", "2"):
         monkeypatch.setenv("MIEN_THREADS", threads)

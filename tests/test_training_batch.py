@@ -155,7 +155,7 @@ COARSE = replace(train_toy.SETTINGS, steps=10, coarse=0.5, record_every=1)
 @pytest.fixture
 def _halved(monkeypatch: pytest.MonkeyPatch) -> None:
     """The toy's pictures are large enough to be halved."""
-    monkeypatch.setattr("mien.training.batch._LEAST_HALVED", 32)
+    monkeypatch.setattr("mien.training.batch.LEAST_HALVED", 32)
 
 
 def sizes_of(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
@@ -181,7 +181,7 @@ def test_the_first_half_of_a_run_sees_pictures_of_half_the_size(tmp_path: Path, 
     monkeypatch.setattr(Targets, "forget", lambda self: forgotten.append(self.width) or forget(self))
     assert sizes_of(tmp_path / "large", monkeypatch) == [(16, 16, 16)] * 5 + [(32, 32, 32)] * 5
     assert forgotten == [16]
-    monkeypatch.setattr("mien.training.batch._LEAST_HALVED", 384)
+    monkeypatch.setattr("mien.training.batch.LEAST_HALVED", 384)
     assert sizes_of(tmp_path / "small", monkeypatch) == [(32, 32, 32)] * 10
 
 

@@ -39,7 +39,7 @@ from mien.training.run import read_face_track
 from mien.training.settings import PRESETS, TrainSettings
 from mien.training.trainer import ProgressBar, train
 
-_ALIGNED_TOGETHER = 4  # number of timesteps that are aligned in one pass
+ALIGNED_TOGETHER = 4  # number of timesteps that are aligned in one pass
 _ALIGNED_JUDGED = 32  # number of training timesteps that say how large gradients are
 _ALIGNED_MOMENTUM = 0.7  # share of the last steps' direction in the next one. Measured: the log, 11-27
 _ALIGNED_EXPRESSION = 10.0
@@ -253,8 +253,8 @@ def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
 
 def _batches(timesteps: list[_Timestep]) -> Iterator[list[_Timestep]]:
     """The timesteps in parts that are drawn together."""
-    for first in range(0, len(timesteps), _ALIGNED_TOGETHER):
-        yield timesteps[first : first + _ALIGNED_TOGETHER]
+    for first in range(0, len(timesteps), ALIGNED_TOGETHER):
+        yield timesteps[first : first + ALIGNED_TOGETHER]
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_los
 from mien.training.parts import BatchFrame
 from mien.training.settings import TrainSettings
 
-_LEAST_HALVED = 384  # least longer side of pictures that are halved at the start of a run, in pixels
+LEAST_HALVED = 384  # least longer side of pictures that are halved at the start of a run, in pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class TrainingData:
 
 def coarse_steps(targets: Items[Targets], settings: TrainSettings) -> int:
     """Number of steps at the start of a run whose pictures are halved: none if some of the pictures are small."""
-    large = all(max(one.width, one.height) >= _LEAST_HALVED for one in targets)
+    large = all(max(one.width, one.height) >= LEAST_HALVED for one in targets)
     return round(settings.coarse * settings.steps) if large else 0
 
 

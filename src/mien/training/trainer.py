@@ -66,7 +66,7 @@ from mien.training.settings import TrainSettings
 from mien.training.whole_head.outline_fit import fitted_faces
 
 ALIGNED_TUNING = 0.2  # share of the learning rates of faces in a training on aligned faces. Measured: the log, 11-27
-_STEADY_EVERY = 25
+STEADY_EVERY = 25
 """Number of steps after which corrections of the head's pose lose what settings do not allow (`steady_pose`)."""
 _REPRESENTATIVE_FRAMES = 12
 """Number of evenly spread frames, and of frames that show turned heads, in which hidden Gaussians are looked for."""
@@ -339,7 +339,7 @@ def _update(state: TrainingState, now: Step, posed: Items[Posed], renderings: It
     state.adam.step(groups, now.progress)
     for one in now.batch:
         state.track.confine(one.index)
-    if now.reaches(_STEADY_EVERY):
+    if now.reaches(STEADY_EVERY):
         state.track.steady_pose()
     random = partial(density_random, now.settings, state.step)
     return state.density.adapt(state.avatar.gaussian_store(), posed[0], now.progress, random)

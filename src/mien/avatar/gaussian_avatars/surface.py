@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
-from mien.avatar.bound_surface import BoundSurface, SurfacePrior
+from mien.avatar.bound_surface import FILL_OPACITY, BoundSurface, SurfacePrior
 from mien.avatar.gaussian_avatars.changes import change_penalties
 from mien.avatar.gaussian_avatars.hair_strands import shell_growth, strand_gaussians
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
@@ -16,7 +16,6 @@ from mien.avatar.ops.triangle_frames import triangle_ellipses, triangle_frames
 from mien.avatar.store import GaussianStore
 from mien.gaussians import sh_from_rgb
 
-FILL_OPACITY = 0.97  # opacity of a fill
 _OPEN_OPACITY = 0.5  # sum of the opacities of a triangle's Gaussians below which its surface is open
 _COLOR_PULL = 0.05
 """Share of the difference to the completed colour that a step takes away where no picture shows a triangle. Measured: a

@@ -22,7 +22,7 @@ from mien.runtime.posing import Face
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _LEARN_SECONDS = 1.0  # time over which the face at rest is learnt, in seconds
-_LEARN_LEAST_FRAMES = 8  # least number of frames from which it is learnt
+LEARN_LEAST_FRAMES = 8  # least number of frames from which it is learnt
 _AWAY_SECONDS = 0.4  # time without a face after which the avatar goes to rest
 _REST_SECONDS = 0.35  # time in which the avatar goes two thirds of the way to rest, in seconds
 _HEAD_CUTOFF = (1.2, 12.0)
@@ -141,11 +141,11 @@ class Follower:
         if self._learning and seconds - self._learning[-1][0] > _AWAY_SECONDS:
             self._learning.clear()
         self._learning.append((seconds, landmarks))
-        if seconds - self._learning[0][0] < _LEARN_SECONDS or len(self._learning) < _LEARN_LEAST_FRAMES:
+        if seconds - self._learning[0][0] < _LEARN_SECONDS or len(self._learning) < LEARN_LEAST_FRAMES:
             return
         seen = [one for _, one in self._learning]
         # A handful of frames says as much as all of them, and a picture must not wait.
-        seen = seen[:: max(1, len(seen) // _LEARN_LEAST_FRAMES)]
+        seen = seen[:: max(1, len(seen) // LEARN_LEAST_FRAMES)]
         self._fit.learn_rest(seen, width, height, self._asked)
         poses = [self._fit.rest_pose(one, width, height) for one in seen]
         middle = poses[len(poses) // 2].rotation

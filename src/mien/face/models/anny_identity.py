@@ -11,7 +11,7 @@ from mien.face.models.anny_source import Control, head_controls, macro_targets, 
 from mien.machine.progress import Advance
 
 _ANNY_PEOPLE = 900  # number of people sampled
-_ANNY_COMPONENTS = 80  # number of identity directions that are kept
+ANNY_COMPONENTS = 80  # number of identity directions that are kept
 _ANNY_LOCAL_SPREAD = 0.17
 """Standard deviation of a local control, which ranges over -1..1. Measured: 0.35 has twice the variance of real people,
 and 0.17 matches published head measurements (log)."""
@@ -87,14 +87,14 @@ def principal_components(
     scale = np.repeat(np.sqrt(weights / weights.sum()), 3)
     weighted = centered * scale
     variances, vectors = np.linalg.eigh(weighted @ weighted.T / len(weighted))
-    order = np.argsort(variances)[::-1][:_ANNY_COMPONENTS]
+    order = np.argsort(variances)[::-1][:ANNY_COMPONENTS]
     # The scaled eigenvector holds the projections onto a component: unit variance is vector * sqrt(s).
     components = vectors[:, order].T @ centered / np.sqrt(len(centered))
     largest = np.abs(components).argmax(1)
-    components = components * np.sign(components[np.arange(_ANNY_COMPONENTS), largest])[:, None]
+    components = components * np.sign(components[np.arange(ANNY_COMPONENTS), largest])[:, None]
     return IdentityBasis(
         mean=reference,
-        components=components.reshape(_ANNY_COMPONENTS, -1, 3),
+        components=components.reshape(ANNY_COMPONENTS, -1, 3),
         explained=np.cumsum(variances[order]) / variances.sum(),
     )
 

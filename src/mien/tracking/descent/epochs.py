@@ -32,7 +32,7 @@ from mien.tracking.fitting.resume import StageCache
 _GLOBAL_RATE = 0.1  # factor of the initial learning rates in the first epoch
 _EPOCH_DECAY = 0.9  # factor of the learning rates from one epoch to the next
 _GOOD_COSINE = 0.5  # least cosine of the viewing angle at which a triangle's texels count fully
-_MOST_BATCHES = 40  # largest number of batches in an epoch
+MOST_BATCHES = 40  # largest number of batches in an epoch
 _TEXTURE_EVERY = 4  # fewest frames whose texture gradients are summed for one step
 
 _PIECE = "descent"
@@ -92,7 +92,7 @@ class Descent:
         pairs = [(sequence, row) for sequence, rows in enumerate(self.state.frames) for row in range(len(rows))]
         order = np.random.default_rng((7, epoch)).permutation(len(pairs))
         drawn = [_Place(*pairs[index]) for index in order]
-        batches = np.array_split(np.arange(len(drawn)), min(_MOST_BATCHES, len(drawn)))
+        batches = np.array_split(np.arange(len(drawn)), min(MOST_BATCHES, len(drawn)))
         scale = _GLOBAL_RATE * _EPOCH_DECAY**epoch
         texture_gradient, seen = torch.zeros_like(self.state.texture), 0
         for batch in batches:

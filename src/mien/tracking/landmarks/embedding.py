@@ -29,8 +29,8 @@ _LEAST_SEEN = 0.25
 """Landmarks may lie on a triangle only if it is seen in at least this share of the pictures. Measured against 0:
 landmarks of lids lie up to 0.9 instead of 3.0 mm inside the eyeball (log, "Face model")."""
 _SUBDIVISIONS = 12  # number of steps along a triangle's side between the points that are tried
-_COARSE_VIEWS = 16  # number of views of the coarse search over all triangles
-_COARSE_SUBDIVISIONS = 3  # number of steps along a triangle's side in the coarse search
+COARSE_VIEWS = 16  # number of views of the coarse search over all triangles
+COARSE_SUBDIVISIONS = 3  # number of steps along a triangle's side in the coarse search
 _BEST_TRIANGLES = 16  # number of triangles that the coarse search passes on
 
 _FACE_REGIONS = ("skin", "face", "lips", "eyelids", "brows", "nose", "scalp", "ears")
@@ -208,10 +208,10 @@ def best_point(
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
     # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
     some = DetectedViews(
-        *(part[:: max(1, len(part) // _COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
+        *(part[:: max(1, len(part) // COARSE_VIEWS)] for part in (views.vertices, views.depth, views.detected))
     )
     everywhere = allowed.nonzero()[:, 0]
-    rough = _errors(some, faces[everywhere], _triangle_grid(_COARSE_SUBDIVISIONS), landmark)
+    rough = _errors(some, faces[everywhere], _triangle_grid(COARSE_SUBDIVISIONS), landmark)
     scores = rough.clamp_max(4 * clamp).sum(0).amin(1)
     triangles = everywhere[scores.topk(min(_BEST_TRIANGLES, len(scores)), largest=False).indices]
     weights = _triangle_grid(_SUBDIVISIONS)

@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien.avatar.avatar import Avatar, Posed
-from mien.avatar.bound_surface import BoundSurface
-from mien.avatar.gaussian_avatars.surface import FILL_OPACITY
+from mien.avatar.bound_surface import FILL_OPACITY, BoundSurface
 from mien.face.head_parts import head_parts
 from mien.gaussians import sh_from_rgb
 from mien.training.footage.coverage import Coverage

@@ -19,7 +19,7 @@ from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.side_views import SideView, SideViews, side_views_of
 from mien.training.whole_head.unseen import Unseen, fills_sides, moved, spare_fills, unseen_of
 
-_HAIR_EVERY = 8  # number of training frames from one correction of the hair's surface to the next
+HAIR_EVERY = 8  # number of training frames from one correction of the hair's surface to the next
 
 
 class WholeHead:
@@ -93,7 +93,7 @@ class WholeHead:
             self._surface.keep_to(self.unseen.prior)
 
     def _after_step(self, step: Step) -> None:
-        hair, surface = self.hair if step.reaches(_HAIR_EVERY) else None, self._surface
+        hair, surface = self.hair if step.reaches(HAIR_EVERY) else None, self._surface
         if hair and surface and hair.correct(surface, step.fraction_done, step.settings.hair_rate):
             self.follow_hair()
         self._prune_hidden(step)

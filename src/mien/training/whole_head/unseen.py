@@ -40,7 +40,7 @@ from mien.training.whole_head.spreading import Surface
 UNSEEN_CONFIDENCE = 0.02
 """Confidence below which a triangle is made up. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90
 degrees; 0.02 was chosen between them (11-23)."""
-_OUTLINE_BAND = 0.025
+OUTLINE_BAND = 0.025
 """Distance in metres from what pictures show up to which unseen triangles are trained. Hair above them is on the
 outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.7, 0.3 and 0.1 dB less; with 50
 mm, or with no fills at all, d3 has 0.1 dB more (log, 11-26)."""
@@ -221,7 +221,7 @@ def beside_shown(
         return torch.zeros_like(shown)
     middles = vertices[face_model.faces.long()].mean(1)
     apart = torch.cdist(middles, middles[shown], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
-    return apart < _OUTLINE_BAND
+    return apart < OUTLINE_BAND
 
 
 def _hair_colors(
