@@ -200,7 +200,7 @@ def seen_of(frames: list) -> list[float | None]:
 
 
 def test_the_largest_and_most_persistent_is_followed_and_landmarks_of_others_are_refused():
-    passing, stranger = (0.5, 0.5, 0.45, 0.5), (*ANN[:3], 0.3)
+    passing, stranger, farther = (0.5, 0.5, 0.45, 0.5), (*ANN[:3], 0.3), (*ANN[:2], 0.15, ANN[3])
     walking = [[(0.75 - 0.025 * step, *BOB[1:])] for step in range(18)]
     for frames, seen in (
         ([[BOB, ANN]] * 10, [0.3] * 10),
@@ -211,6 +211,7 @@ def test_the_largest_and_most_persistent_is_followed_and_landmarks_of_others_are
         # A stranger who comes later to the same place has other colours.
         ([[ANN]] * 40 + [[]] * 40 + [[stranger]] * 20, [0.3] * 40 + [None] * 60),
         ([[ANN]] * 40 + [[]] * 40 + [[ANN]] * 20, [0.3] * 40 + [None] * 40 + [0.3] * 20),
+        ([[ANN]] * 40 + [[]] * 40 + [[farther]] * 20, [0.3] * 40 + [None] * 40 + [0.3] * 20),
     ):
         assert seen_of(frames) == seen, frames
     crowded = choose_person(survey_of([[ANN]] * 40 + [[passing, ANN]] * 4 + [[ANN]] * 10)).crowded
