@@ -125,9 +125,9 @@ def _to_uint8(picture: np.ndarray) -> np.ndarray:
     return np.rint(picture.clip(0, 255)).astype(np.uint8)
 
 
-TEMPLATE = Path(__file__).with_name("page.html")
-WEBGPU = Path(__file__).with_name("webgpu.js")
-MICROPHONE = Path(__file__).with_name("microphone.html")
+TEMPLATE = Path(__file__).with_name("shared") / "page.html"
+WEBGPU = TEMPLATE.with_name("webgpu.js")
+MICROPHONE = TEMPLATE.with_name("microphone.html")
 _SILENT = "; form-action 'none'; base-uri 'none'"
 """Additions to the policy of a page with a microphone, so that nothing that it hears can leave it."""
 _SIDE = 512
