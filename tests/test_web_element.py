@@ -51,15 +51,9 @@ viewer.background = [1, 1, 1, 1];
 viewer.draw();
 return viewer.canvas.toDataURL();
 """
+PIXELS = "const { width, height } = avatar.viewer.canvas; avatar.style = ''; return width * height;"
 PAGE = '<link rel="icon" href="data:,"><canvas id="scene" style="width: 400px; height: 400px"></canvas>'
 ONE_BY_ONE = "for (const [name, value] of [['jawOpen', 0.7], ['eyeBlinkLeft', 1]]) avatar.setExpression(name, value);"
-PIXELS = """
-Object.assign(avatar.style, { width: "2000px", height: "1600px" });
-for (let i = 0; i < 3; ++i) await new Promise(requestAnimationFrame);
-const { width, height } = avatar.viewer.canvas;
-avatar.removeAttribute("style");
-return width * height;
-"""
 STILL = """
 avatar.removeAttribute("idle");
 for (let i = 0; i < 3; ++i) await new Promise(requestAnimationFrame);
@@ -83,7 +77,7 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
         script("avatar.expression = '';", ONE_BY_ONE, SHOT),
         script("avatar.setAttribute('yaw', '20');", SHOT),
         *(script(f"avatar.setAttribute('yaw', '{yaw}');", AHEAD) for yaw in (0, 30, -30)),
-        script(PIXELS),
+        script("avatar.style = 'width: 2000px; height: 1600px';", STILL, PIXELS),
         "[...['role', 'aria-label'].map((name) => avatar.getAttribute(name)), avatar.setExpression('smirk', 1),"
         " avatar.viewer.canvas.tabIndex]",
         script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone;"),
