@@ -283,13 +283,9 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     model = toy[0]
     vertices, ones = model.head_vertices(toy_face(1))[0], torch.ones(len(model.faces))
     colors, middle = torch.zeros(len(ones), 3), model.template[model.faces].mean(1)
+    sides = (middle[:, 2] > 0) | (middle[:, 0] > 0), middle[:, 0] > 0, middle[:, 1] < 0
     front_and_left, left, lower, everything, nothing = (
-        Coverage(shown, colors, ones)
-        for shown in (
-            *(part.float() for part in ((middle[:, 2] > 0) | (middle[:, 0] > 0), middle[:, 0] > 0, middle[:, 1] < 0)),
-            ones,
-            0 * ones,
-        )
+        Coverage(shown, colors, ones) for shown in (*(side.float() for side in sides), ones, 0 * ones)
     )
     assert filmed_yaws(model, vertices, everything) == (180, 180)
     right, far = filmed_yaws(model, vertices, front_and_left) or (0, 0)
