@@ -32,7 +32,6 @@ from mien.training.whole_head.completion import complete_colors, vertex_means
 from mien.training.whole_head.contribution import contributions, prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.part import prepare_whole_head
-from mien.training.whole_head.spreading import Surface
 from mien.training.whole_head.unseen import Unseen
 from plain_settings import plain_run
 from test_training_resume import RESULTS
@@ -365,11 +364,3 @@ def test_vertices_get_the_mean_of_their_triangles(anny):
     assert vertices.isfinite().all()
     around = (anny.faces == anny.faces[100, 0]).any(1)
     assert torch.allclose(vertices[anny.faces[100, 0]], colors[around].mean(0), atol=1e-6)
-
-
-def test_what_is_known_better_spreads_more() -> None:
-    corners = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
-    apart = torch.cat([corners + torch.tensor([x, 0, 0]) for x in (-0.03, 0.0, 0.03)])
-    values, known = torch.tensor([[0.0], [0.5], [1.0]]), torch.tensor([0.1, 0, 1])
-    found = Surface.of(apart, torch.arange(9).view(3, 3)).spread(values, known, torch.ones(3, dtype=torch.bool))
-    assert float(found[1]) == pytest.approx(10 / 11)
