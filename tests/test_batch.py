@@ -157,8 +157,10 @@ def test_what_runs_is_shown_before_a_row_ends(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Holder):
-    batch, row = Batch(tmp_path), stub_row("long")
-    batch.write_plan([row])
+    batch, (row, *others) = Batch(tmp_path), (stub_row("long"), stub_row("done"), stub_row("failed"))
+    batch.write_plan([row, *others])
+    for other in others:
+        batch.write_state(State(other.name, other.name, other.fingerprint, seconds=10.0))
     log = batch.log_file("long")
     log.parent.mkdir(parents=True)
     with mortal.holding(batch.state_file("long")):
@@ -177,6 +179,7 @@ def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Hol
                 file.write(more)
             found = batch_progress(batch)["rows"][0]
             assert (found["stage"], found["percent"]) == (stage, percent)
+        assert batch_progress(batch)["seconds_left"] == 10, "what failed is not waited for"
 
 
 def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -66,10 +66,12 @@ def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
     batch = Batch(tmp_path)
     (tmp_path / "rows" / "ann").mkdir(parents=True)
     (tmp_path / "rows" / "ann" / "me.html").touch()
-    write_wall(batch, scored(batch))
+    rows = scored(batch)
+    write_wall(batch, [*rows, {**rows[0], "run": "not scored", "psnr": ""}])
     page = (tmp_path / "index.html").read_text()
+    assert page.index("not scored") < page.index('data-psnr="30.0"'), "nobody knows how bad it is"
     assert page.index('data-psnr="30.0"') < page.index('data-psnr="31.0"') < page.index('data-psnr="33.0"')
-    assert page.count('<a href="rows/ann/me.html">alive</a>') == 2  # it has two runs
+    assert page.count('<a href="rows/ann/me.html">alive</a>') == 3  # it has three runs
     assert "rows/bob/me.html" not in page
     assert "&lt;b&gt;no face" in page
     assert "<b>no face" not in page

@@ -158,6 +158,10 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
     asked = last(one, open_mouth, 3.0)
     assert asked.expression[column("jawOpen")] < 0.1, "who asks for it has this face as the one at rest"
     np.testing.assert_allclose(last(follower(), turned).head_rotation, [0, 0.85, 0], atol=0.1)
+    coefficients = np.array([float(name.startswith("eyeBlink")) for name in fit.names])
+    fit.learn_rest([quiet, fit.pixels(np.eye(3), place, coefficients, SIZE, SIZE), quiet], SIZE, SIZE)
+    found = fit.pixels(np.eye(3), place, 0 * coefficients, SIZE, SIZE)
+    np.testing.assert_allclose(found, quiet, atol=0.1, err_msg="a blink does not count")
 
 
 @pytest.mark.unchecked

@@ -312,6 +312,7 @@ def test_a_screen_is_keyed_and_its_light_is_taken_off(name: str, uneven: float):
     truth, found, filmed = (one @ tint for one in (255 * alpha[..., None] * colors, front, image.astype(float)))
     assert filmed[edge].max() > 3, "the picture has it"
     assert found[edge].max() < 3
+    assert found[edge].mean() < 0.12 * truth[edge].mean() < 0, "what has none of the tint gets none"
     assert np.abs(found - truth)[alpha == 1].mean() < 3
 
 

@@ -80,17 +80,17 @@ def test_mattes_have_their_border_on_the_edge_of_the_picture_and_of_what_is_new(
     assert np.abs(alpha - truth).sum() < 0.4 * np.abs(soft - truth).sum()
     assert (alpha[:235] == 0).all()
     assert (alpha[285:] == 1).all()
-    plate = np.random.default_rng(0).integers(60, 200, (160, 160, 3)).astype(np.uint8)
-    plate = cv2.GaussianBlur(plate, (0, 0), 3)
-    truth = cv2.ellipse(np.zeros((160, 160), np.uint8), (80, 90), (36, 50), 0, 0, 360, 255, -1)
+    plate = np.random.default_rng(0).integers(0, 256, (480, 480, 3)).astype(np.uint8)
+    plate = cv2.GaussianBlur(plate, (0, 0), 2)
+    truth = cv2.ellipse(np.zeros((480, 480), np.uint8), (240, 270), (108, 150), 0, 0, 360, 255, -1)
     picture = np.where(truth[..., None] > 0, np.array([220, 60, 60], np.uint8), plate)
-    mask = cv2.GaussianBlur(np.roll(truth, 4, axis=1), (0, 0), 6).astype(np.float32) / 255
-    for scene in (plate, np.roll(plate, (1, 2), axis=(0, 1)), (plate * 0.85).astype(np.uint8)):
+    mask = cv2.GaussianBlur(np.roll(truth, 12, axis=1), (0, 0), 18).astype(np.float32) / 255
+    for scene in (plate, np.roll(plate, (9, 12), axis=(0, 1)), (plate * 0.85).astype(np.uint8)):
         wrong, before = (
-            np.abs(alpha.astype(float) - truth)[8:-8, 8:-8].mean()
+            np.abs(alpha.astype(float) - truth)[16:-16, 16:-16].mean()
             for alpha in (plate_matte(picture, mask, scene), 255 * mask)
         )
-        assert wrong < min(6, 0.5 * before)
+        assert wrong < min(2, 0.5 * before)
 
 
 @pytest.mark.unchecked

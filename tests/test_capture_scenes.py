@@ -4,6 +4,7 @@ Drawn people stand in front of plain walls, so that the true landmarks are known
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,11 +14,12 @@ from capture_helpers import face_picture, interrupt_at, tree_bytes
 from mien.capture import capture_video, process, read_capture
 from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
+from mien.capture.person import same_person
 from mien.capture.person.crop import Crop
 from mien.capture.person.faces import MAX_FACES, LandmarkDetector
 from mien.capture.person.matte_owner import held, without_others
 from mien.capture.person.people import choose_person
-from mien.capture.person.same_person import group_people, shape_difference
+from mien.capture.person.same_person import check_neighbors, group_people, shape_difference
 from mien.capture.person.survey import Survey
 from mien.capture.process import LandmarkFollower
 from mien.capture.settings import CaptureSettings
@@ -200,7 +202,7 @@ def seen_of(frames: list) -> list[float | None]:
 
 
 def test_the_largest_and_most_persistent_is_followed_and_landmarks_of_others_are_refused():
-    passing, stranger = (0.5, 0.5, 0.45, 0.5), (*ANN[:3], 0.3)
+    passing, stranger, farther = (0.5, 0.5, 0.45, 0.5), (*ANN[:3], 0.3), (*ANN[:2], 0.15, ANN[3])
     walking = [[(0.75 - 0.025 * step, *BOB[1:])] for step in range(18)]
     for frames, seen in (
         ([[BOB, ANN]] * 10, [0.3] * 10),
@@ -211,6 +213,7 @@ def test_the_largest_and_most_persistent_is_followed_and_landmarks_of_others_are
         # A stranger who comes later to the same place has other colours.
         ([[ANN]] * 40 + [[]] * 40 + [[stranger]] * 20, [0.3] * 40 + [None] * 60),
         ([[ANN]] * 40 + [[]] * 40 + [[ANN]] * 20, [0.3] * 40 + [None] * 40 + [0.3] * 20),
+        ([[ANN]] * 40 + [[]] * 40 + [[farther]] * 20, [0.3] * 40 + [None] * 40 + [0.3] * 20),
     ):
         assert seen_of(frames) == seen, frames
     crowded = choose_person(survey_of([[ANN]] * 40 + [[passing, ANN]] * 4 + [[ANN]] * 10)).crowded
@@ -275,6 +278,19 @@ def test_people_are_told_apart_in_similar_and_in_mirrored_poses_alone() -> None:
     assert shape_difference(anna, drawn_shapes(2, 0.4, 6, pictures=2)) is None
     captures = [drawn_shapes(2, 0.4, 7), anna, drawn_shapes(2, 0.4, 8), again, drawn_shapes(3, 0.4, 9)]
     assert group_people(captures, [30, 100, 60, 20, 95]) == [[1, 3], [4], [0, 2]]
+    assert group_people([drawn_shapes(2, 1.4, 5), *captures[:2]], [10, 60, 100]) == [[0, 2], [1]], "as the first person"
+
+
+def test_a_neighbor_in_another_pose_hides_no_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = [drawn_shapes(2, 0.4, 6), drawn_shapes(1, 1.4, 5), drawn_shapes(1, 0.4, 1)]
+    monkeypatch.setattr(same_person, "face_shapes", lambda pictures, detector: shapes[pictures.max()])
+    new = np.zeros((1, 9, 9, 3), np.uint8)
+    for place in (tmp_path / "1" / "capture", tmp_path / "2" / "capture"):
+        place.mkdir(parents=True)
+        (place / "capture.json").touch()
+    read = lambda place: SimpleNamespace(source={}, images=new[:, None] + np.uint8(place.parent.name))  # noqa: E731
+    monkeypatch.setattr(same_person, "read_capture", read)
+    refuses(f"shows another person than {tmp_path / '2'}", check_neighbors, tmp_path, "new", Path("new"), new, "auto")
 
 
 @pytest.fixture(scope="module")

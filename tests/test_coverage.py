@@ -283,9 +283,9 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     model = toy[0]
     vertices, ones = model.head_vertices(toy_face(1))[0], torch.ones(len(model.faces))
     colors, middle = torch.zeros(len(ones), 3), model.template[model.faces].mean(1)
-    front_and_left, left, everything, nothing = (
-        Coverage(shown, colors, ones)
-        for shown in (((middle[:, 2] > 0) | (middle[:, 0] > 0)).float(), (middle[:, 0] > 0).float(), ones, 0 * ones)
+    sides = (middle[:, 2] > 0) | (middle[:, 0] > 0), middle[:, 0] > 0, middle[:, 1] < 0
+    front_and_left, left, lower, everything, nothing = (
+        Coverage(shown, colors, ones) for shown in (*(side.float() for side in sides), ones, 0 * ones)
     )
     assert filmed_yaws(model, vertices, everything) == (180, 180)
     right, far = filmed_yaws(model, vertices, front_and_left) or (0, 0)
@@ -297,6 +297,7 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     filmed, degrees = Filmed(zeros, zeros, zeros[:, None], zeros, angles), np.degrees(angles)
     for coverage, expected in (
         (left, [[degrees[0, 0], 60], [-30, 30]]), (everything, [[-60, 60], [-30, 30]]), (nothing, degrees),
+        (lower, [[-60, 60], [-30, degrees[1, 1]]]),
     ):  # fmt: skip
         found = np.degrees(with_shown_angles(filmed, model, vertices, coverage).head_angles)
         np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -219,6 +219,7 @@ def test_a_benchmark_person_without_its_mattes_is_no_raw_recording(scene: Scene,
 def test_a_take_of_live_link_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = writers.write_take(tmp_path / "20240131_Me_3")
     (folder / "Me_3_iPhone_raw.csv").write_text("Timecode,BlendshapeCount,")
+    (folder / "Me_3_iPhone.csv").write_bytes((folder / "Me_3_iPhone_cal.csv").read_bytes() + b"\n")
     (footage,) = checks.read(folder, "live-link-face")
     assert (footage.name, footage.videos[0].name) == ("20240131_Me_3", "Me_3_iPhone.mov")
     assert footage.files["driving.csv"] == (folder / "Me_3_iPhone_cal.csv").read_bytes()

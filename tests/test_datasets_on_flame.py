@@ -110,7 +110,7 @@ def test_the_imported_mesh_is_drawn_over_some_pictures(name: str, scene: Scene, 
 
 
 @pytest.mark.unchecked
-def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path, monkeypatch) -> None:
+def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path, monkeypatch, capsys) -> None:
     matted: list[np.ndarray] = []
 
     def fill(images: np.ndarray, mattes: np.ndarray, plate: np.ndarray | None = None) -> None:
@@ -123,6 +123,7 @@ def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path
     folder = layouts.write_tracker_output(tmp_path / "me", scene)
     found = checks.read(folder, "insta", scene.model)
     checks.check_import(found, layouts.TRACKED["insta"], scene)
+    assert "lids are closed in 100% of the frames" in capsys.readouterr().err, "one of the two is enough"
     check_retracked(folder, "insta", scene)
     assert "mattes: they are made by mien" in checks.surveyed(folder).missing
     assert len(matted) == 2

@@ -209,6 +209,8 @@ def test_pauses_and_dropped_and_odd_frames_do_not_change_the_rate(capsys: pytest
         assert frame_rate(times, nominal) == pytest.approx(30)
     assert pace_report("clip", times)["pauses"] == 1
     assert "clip: a pause of 19.0 s without a frame, after 1.0 s" in capsys.readouterr().err
+    pace_report("clip", np.concatenate([times[:40], 60 + times]))
+    assert "3 pauses, the longest of 39.7 s without a frame, after 20.3 s" in capsys.readouterr().err
     random = np.random.default_rng(0)
     kept = np.flatnonzero(random.uniform(size=300) > 0.2)
     assert frame_rate((kept - kept[0]) / 25, 25.0) == 25
@@ -248,6 +250,8 @@ def test_a_driver_moves_at_the_times_of_its_video(tmp_path: Path) -> None:
     steady = filmed_at(tmp_path / "steady", np.arange(9))
     assert steady.fps == 25
     assert torch.equal(steady.face.head_rotation[:, 1], 0.01 * torch.arange(9).float())
+    filmed_at(tmp_path / "slow", np.arange(4) * 2, 12.5)
+    assert read_tracked_driver([tmp_path / "slow", tmp_path / "steady"]).fps == 25, "the rate of the longer one"
 
 
 def test_a_driver_waits_in_a_pause_but_not_in_one_that_never_ends(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from mien.face.models.npz import read_npz
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.pipeline.expression import with_expression
 from mien.render.camera_paths import sway
+from mien.runtime.camera_paths import zoom_for_all
 from mien.tracking.fitting.views import Views
 from mien.tracking.scoring import cut_matte
 from refusals import refuses
@@ -42,6 +43,11 @@ def test_a_fitted_view_keeps_its_middle_and_a_resized_one_scales_each_axis() -> 
     resized = runtime.Camera(K, np.eye(4, dtype=np.float32), 200, 100).resized(100, 300)
     assert (resized.width, resized.height) == (100, 300)
     assert resized.K.tolist() == [[150, 0, 45], [0, 960, 180], [0, 0, 1]]
+    # Heads are drawn smaller until they reach neither the top nor a side.
+    for edge, wanted in ((np.s_[0, 4], 0.7), (np.s_[4, 0], 0.7), (np.s_[4, -1], 0.7), (np.s_[-1, 4], 1.0)):
+        masks = {zoom: np.zeros((9, 9), bool) for zoom in (1.0, 0.85, 0.7)}
+        masks[1.0][edge] = masks[0.85][edge] = True
+        assert zoom_for_all(masks.__getitem__) == wanted
 
 
 def test_a_synthetic_clip_has_the_number_of_frames_nearest_to_its_length() -> None:

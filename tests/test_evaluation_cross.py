@@ -118,6 +118,10 @@ def test_drivers_that_cannot_drive(folders: tuple[Path, Path], tmp_path: Path, m
     own, driver = folders
     run = own.parent.parent / "runs" / "first"
     refuses("no face is found in the driver's pictures", cross_reenactment, run, own, [driver], 0)
+    seldom = lambda self, timestep: np.full((8, 8, 3), 255 if timestep % 2 else 90, np.uint8)  # noqa: E731
+    monkeypatch.setattr(cross.Driven, "driver_picture", seldom)
+    entry = cross_reenactment(run, own, [driver], 0)[0]
+    assert (entry["faces_found"], entry["frames"]) == (1.0, 5), "where the driver has no face, none can be missed"
     tracking = replace(make_experiment(timesteps=10).sequences[0].tracking, face_model_hash="other")
     write_tracking(tmp_path / "sequences" / "x" / "tracking", tracking)
     refuses("track the driver with the avatar's", cross_reenactment, run, own, [tmp_path / "sequences" / "x"], 0)

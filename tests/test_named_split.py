@@ -52,6 +52,7 @@ def test_table_2(subject: str) -> None:
         assert driving_sequences(split.left_out) == [name for name in names if "FREE" in name]
         assert with_named_split(NAMED, split).held_out_sequences == (split.held_out,)
     assert split_by_name(FOLDERS, "104", subject).subject == subject, "a given subject wins over the folder"
+    assert split_by_name(FOLDERS, "104", subject.lstrip("0")).subject == subject
 
 
 def test_what_the_names_do_not_say_and_what_is_withheld_twice_is_told() -> None:

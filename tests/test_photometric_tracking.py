@@ -201,6 +201,8 @@ def test_timesteps_between_keyframes_move_as_these_do():
     assert torch.equal(moved[:, 6:], state[:, 6:])
     wrong = (moved - state - step)[1::2, :6].norm(dim=1)
     assert float(wrong.mean()) < 0.2 * float((step - step.mean(0))[1::2, :6].norm(dim=1).mean())
+    moved = move_like_keyframes(state, keyframes, torch.ones_like(state)[keyframes])
+    torch.testing.assert_close(moved[:, :6], state[:, :6] + 1)
 
 
 SIDE, SIGMA, OUTLIER, LEAST_COSINE = 72, 0.07, 2.0, 0.25

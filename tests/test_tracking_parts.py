@@ -78,6 +78,9 @@ def test_free_parameters():
     smoothness = smoothness_of(layout, valid, 25.0, SmoothnessSettings())
     assert smoothness.linked.tolist() == [False, True, False, False, True, True, False]
     assert smoothness.precision[6] == 0 < smoothness.precision[7]
+    # An acceleration counts alike at any rate: its second difference is a quarter at twice the rate.
+    faster = smoothness_of(layout, valid, 50.0, SmoothnessSettings()).precision
+    torch.testing.assert_close(faster, 16 * smoothness.precision)
     assert (smoothness.precision[layout.joint_columns] == 0).all()
     # Gaps at the ends repeat the nearest.
     face = replace(model.neutral(2), head_translation=torch.tensor([[0.0, 0, -1], [1.0, 0, -1]]))

@@ -51,6 +51,7 @@ viewer.background = [1, 1, 1, 1];
 viewer.draw();
 return viewer.canvas.toDataURL();
 """
+PIXELS = "const { width, height } = avatar.viewer.canvas; avatar.style = ''; return width * height;"
 PAGE = '<link rel="icon" href="data:,"><canvas id="scene" style="width: 400px; height: 400px"></canvas>'
 ONE_BY_ONE = "for (const [name, value] of [['jawOpen', 0.7], ['eyeBlinkLeft', 1]]) avatar.setExpression(name, value);"
 STILL = """
@@ -76,6 +77,7 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
         script("avatar.expression = '';", ONE_BY_ONE, SHOT),
         script("avatar.setAttribute('yaw', '20');", SHOT),
         *(script(f"avatar.setAttribute('yaw', '{yaw}');", AHEAD) for yaw in (0, 30, -30)),
+        script("avatar.style = 'width: 2000px; height: 1600px';", STILL, PIXELS),
         "[...['role', 'aria-label'].map((name) => avatar.getAttribute(name)), avatar.setExpression('smirk', 1),"
         " avatar.viewer.canvas.tabIndex]",
         script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone;"),
@@ -88,7 +90,7 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
     ]  # fmt: skip
     with served(site) as address:
         told = browse(f"{address}/index.html", steps, size=(500, 600))
-    rest, open_, same, turned, ahead, left, right, facts, gone, error = told["results"]
+    rest, open_, same, turned, ahead, left, right, pixels, facts, gone, error = told["results"]
     assert left - 0.2 > ahead > right + 0.2, "yaw goes to the left of the person, as for `mien render --yaw`"
     head = drawn_head(2000, rank=2)
     shut, wide = (rendered(head, face, 320)[0] for face in ({"jawOpen": 0.0}, {"jawOpen": 0.7, "eyeBlinkLeft": 1.0}))
@@ -98,6 +100,7 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
     assert psnr(shut, wide) < 40
     assert likeness(turned, wide) < 30
     assert facts == ["img", "Avatar of drawn", False, 0]
+    assert 1_590_000 < pixels < 1_610_000, "a large one is as sharp as a device can afford"
     assert gone is None
     words = "nobody.packed cannot be fetched: the server answers 404"
     assert error == [words, words, 0], "the box says it, too"
