@@ -1,1 +1,1 @@
-"""Sources."""
+"""Recordings of other programs and voices, read as motions."""

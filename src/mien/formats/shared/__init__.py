@@ -1,1 +1,1 @@
-"""Shared."""
+"""What several formats hold: columns of Gaussians, textures, the packed form of pages, FLAME's parameters."""
