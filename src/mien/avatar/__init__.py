@@ -1,4 +1,4 @@
-"""Avatars: functions from face parameters to Gaussians. Each method has one file, and one for its settings."""
+"""Avatars: functions from face parameters to Gaussians. Each method has a folder."""
 
 import lazy_loader
 

@@ -2,9 +2,8 @@
 
 `model` and `params` are the classes; `posing` computes vertices natively, and `parts` finds eyes and mouth in pictures.
 `listing` says which models there are, without torch; `loading` reads them and keeps them
-in the user's `cache`, and `checks` tests what is read. Models come from two sources: `anny` (with `anny_source`,
-`anny_topology` and `anny_identity`), and files in the schema of `flame` (with `npz`, `inert_pickle` and `chart`, which
-makes texture coordinates for a head without any). `mirror` finds each triangle's image on the other side.
+in the user's `cache`, and `checks` tests what is read. `models/` has the families of models. `chart` makes texture
+coordinates for a head without any, and `mirror` finds each triangle's image on the other side.
 """
 
 import lazy_loader
