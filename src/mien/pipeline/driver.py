@@ -1,4 +1,4 @@
-"""What drives an avatar, as people name it, and what is wrong with it before anything is opened."""
+"""Checks of a driver as people name it, before anything is opened."""
 
 from dataclasses import fields
 from pathlib import Path

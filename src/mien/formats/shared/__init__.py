@@ -1,1 +1,1 @@
-"""What several formats hold: columns of Gaussians, textures, the packed form of pages, FLAME's parameters."""
+"""Parts that several formats share: columns of Gaussians, textures, the packed form of pages, FLAME's parameters."""
