@@ -156,6 +156,7 @@ lint: setup
 	$(BIN)/ruff format --check src tests examples benchmarks release docs/site docs/pictures
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/python tests/sizes.py
+	$(BIN)/python tests/rooms.py mien
 	$(BIN)/python tests/seams.py
 	$(BIN)/typos
 	$(BIN)/lint-imports
