@@ -12,9 +12,9 @@ from mien.viewer.meters import Meters
 from mien.viewer.session import Seen, Session
 
 if TYPE_CHECKING:
-    import mien.capture.person.faces
-    import mien.driving.live.follower
-    import mien.media.live_camera
+    from mien.capture.person.faces import LandmarkDetector
+    from mien.driving.live.follower import Follower
+    from mien.media.live_camera import LiveCamera, LiveFrame
 
 STAGES = ("camera", "tracking", "drawing")
 _PATIENCE_SECONDS = 0.04
@@ -33,24 +33,17 @@ class CameraSwitch:
     def __init__(
         self,
         session: Session,
-        open_camera: Callable[[], "mien.media.live_camera.LiveCamera"],
-        make: Callable[[], "mien.driving.live.follower.Follower"],
+        open_camera: Callable[[], "LiveCamera"],
+        make: Callable[[], "Follower"],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Prepare to follow; nothing is opened before `start`.
-
-        Args:
-            session: What shows the avatar.
-            open_camera: Returns the camera, not opened yet.
-            make: Returns a new follower.
-            clock: Returns the time in seconds; it is the camera's clock.
-        """
+        """Prepare to follow; nothing is opened before `start`. `clock` is the camera's, in seconds."""
         self._session, self._open, self._make, self._clock = session, open_camera, make, clock
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._camera: mien.media.live_camera.LiveCamera | None = None
-        self._follower: mien.driving.live.follower.Follower | None = None
+        self._camera: LiveCamera | None = None
+        self._follower: Follower | None = None
         self.meters = Meters(STAGES)
         self.watch: Callable[[Seen], None] | None = None
         """Is called after each frame that was followed."""
@@ -111,9 +104,7 @@ class CameraSwitch:
             return ["The camera is away. mien waits for it."]
         return [_WORDS[follower.state], *self.meters.words(self._clock())]
 
-    def _run(
-        self, camera: "mien.media.live_camera.LiveCamera", follower: "mien.driving.live.follower.Follower"
-    ) -> None:
+    def _run(self, camera: "LiveCamera", follower: "Follower") -> None:
         from mien.capture.person.faces import LandmarkDetector
 
         try:
@@ -125,12 +116,7 @@ class CameraSwitch:
             self.error = error
         self.ended = self.error is not None or camera.ended
 
-    def _follow(
-        self,
-        camera: "mien.media.live_camera.LiveCamera",
-        follower: "mien.driving.live.follower.Follower",
-        detector: "mien.capture.person.faces.LandmarkDetector",
-    ) -> None:
+    def _follow(self, camera: "LiveCamera", follower: "Follower", detector: "LandmarkDetector") -> None:
         number, frames, last = -1, 0, None
         while not self._stopping.is_set():
             frame = camera.newest(number, _PATIENCE_SECONDS)
@@ -150,9 +136,9 @@ class CameraSwitch:
 
     def _show(
         self,
-        follower: "mien.driving.live.follower.Follower",
+        follower: "Follower",
         landmarks: Float[np.ndarray, "l 2"] | None,
-        frame: "mien.media.live_camera.LiveFrame",
+        frame: "LiveFrame",
         seconds: float,
     ) -> None:
         height, width = frame.picture.shape[:2]

@@ -31,7 +31,7 @@ class Meters:
             self._recent[stage].append(now)
 
     def delay(self, seconds: float) -> None:
-        """Take account of the time from a frame that came in to its picture that went out."""
+        """Note the time from a frame that came in to its picture that went out."""
         with self._lock:
             self._delays.append(seconds)
 
