@@ -17,12 +17,7 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
     """Write the page from the entries of the results."""
     shown = [_card(batch, row) for row in rows if row.get("run")]
     shown.sort(key=lambda card: card["figures"].get("psnr", float("-inf")))
-    missing = [
-        {"name": row["name"], "status": row["status"], "error": row.get("error", "")}
-        for row in rows
-        if not row.get("run")
-    ]
-    failed = [row for row in missing if row["status"] == "failed"]
+    failed = [row for row in rows if not row.get("run") and row["status"] == "failed"]
     compared = paired(rows)
     text = render(
         "batch/templates/wall.html",

@@ -8,8 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from mien.batch.engines import EngineOptions, Work
-from mien.batch.plan import Row
+from mien.batch.plan import Batch, Options, Row, Work
 from mien.batch.row import stop_attempts
 from mien.errors import UserError
 
@@ -21,8 +20,8 @@ _STOP_SECONDS = 0.5
 """Seconds between two requests to stop. A row may start after the first one."""
 
 
-def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
-    """Run the rows here, as many at once as jobs and memory allow. See `mien.batch.engines`.
+def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iterator[tuple[Row, Any]]:
+    """Run the rows here, as many at once as jobs and memory allow (`mien.batch.drive` says what an engine does).
 
     Whatever stops this function (Ctrl-C, SIGTERM) stops the rows, too.
     """
@@ -47,7 +46,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
                 stop_attempts()
 
 
-def jobs_here(rows: Sequence[Row], options: EngineOptions) -> int:
+def jobs_here(rows: Sequence[Row], options: Options) -> int:
     """How many rows run at once: as asked, or as many as fit the cores (two threads each) and the memory."""
     if options.jobs:
         return options.jobs
