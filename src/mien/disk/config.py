@@ -90,10 +90,8 @@ COUNT_OR_NONE = Range(0, 100_000)
 def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
     """Check every number of some settings, and of nested settings, against the range beside its field.
 
-    Args:
-        settings: A dataclass.
-        option: Turns the dotted name of a field into the option that sets it: `density.rounds` ->
-            "--method.density.rounds".
+    `option` turns the dotted name of a field into the option that sets it: `density.rounds` ->
+    "--method.density.rounds".
     """
     hints = get_type_hints(type(settings), include_extras=True)
     for field in fields(settings):
@@ -105,12 +103,12 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
         if allowed is not None:
             check_range(value, allowed, option(field.name))
         for mark in marks_of(hint):
-            if isinstance(mark, NotBelow) and value < getattr(settings, mark.other):
-                other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
-                raise UserError(f"{option(field.name)} {shown(value)}: give at least as much as {other}")
-            if isinstance(mark, Above) and value <= getattr(settings, mark.other):
-                other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
-                raise UserError(f"{option(field.name)} {shown(value)}: give more than {other}")
+            if isinstance(mark, NotBelow | Above):
+                least, above = getattr(settings, mark.other), isinstance(mark, Above)
+                if value < least or (above and value == least):
+                    asked = "more than" if above else "at least as much as"
+                    other = f"{option(mark.other)} {shown(least)}"
+                    raise UserError(f"{option(field.name)} {shown(value)}: give {asked} {other}")
 
 
 def check_range(value: Any, allowed: Range, option: str) -> None:
