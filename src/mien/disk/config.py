@@ -5,6 +5,7 @@ import difflib
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -93,7 +94,7 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
     `option` turns the dotted name of a field into the option that sets it: `density.rounds` ->
     "--method.density.rounds".
     """
-    hints = get_type_hints(type(settings), include_extras=True)
+    hints = _hints_of(type(settings))
     for field in fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if is_dataclass(value):
@@ -137,6 +138,12 @@ def marks_of(hint: Any) -> tuple[Any, ...]:
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
 
 
+@cache
+def _hints_of(kind: type) -> dict[str, Any]:
+    """The type hints of a dataclass, with the marks beside them."""
+    return get_type_hints(kind, include_extras=True)
+
+
 def _short(number: float | int) -> str:
     return str(number) if isinstance(number, int) else f"{number:g}"
 
@@ -176,7 +183,7 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
         raise UserError(f"{where} {_in_short(changes)}: give an object of settings, {{...}}")
     if changes.get("kind", type(base).__name__) != type(base).__name__:
         raise UserError(f"{where}.kind {_in_short(changes['kind'])}: give {type(base).__name__!r}, or leave it out")
-    hints = get_type_hints(type(base), include_extras=True)
+    hints = _hints_of(type(base))
     known = [f.name for f in fields(base)]
     changed = {}
     for name, change in changes.items():
@@ -201,7 +208,7 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
 
 def for_loading(settings: Any) -> Any:
     """The same settings, with the smallest values of those that matter only for a new avatar (`ToLoad`)."""
-    hints = get_type_hints(type(settings), include_extras=True)
+    hints = _hints_of(type(settings))
     marks = {name: mark for name, hint in hints.items() for mark in marks_of(hint) if isinstance(mark, ToLoad)}
     return replace(settings, **{name: mark.value for name, mark in marks.items()})
 
@@ -264,7 +271,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}")
-    hints = get_type_hints(hint, include_extras=True)
+    hints = _hints_of(hint)
     known = [f.name for f in fields(hint)]
     unknown, missing = set(value) - {*known, "kind"}, [name for name in known if name not in value]
     if unknown or missing:

@@ -219,8 +219,19 @@ def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | Non
 
 
 def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
-    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy."""
-    return read_safetensors(path, safetensors.numpy.load_file, stage)
+    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy.
+
+    No number is infinite. NaN means that a number is not known.
+    """
+    return read_safetensors(path, lambda file: _finite(safetensors.numpy.load_file(file)), stage)
+
+
+def _finite(arrays: Mapping[str, Any]) -> Mapping[str, Any]:
+    for name, array in arrays.items():
+        numbers = np.asarray(array)
+        if numbers.dtype.kind == "f" and np.isinf(numbers).any():
+            raise ValueError(f"{name!r} holds infinite numbers")
+    return arrays
 
 
 def read_safetensors(
@@ -272,7 +283,7 @@ def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping
 
 
 def read_tensors(path: Path, stage: str = _ANY_STAGE, remedy: str | None = None) -> "dict[str, Tensor]":
-    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`."""
+    """Read safetensors as torch tensors on the CPU, as `read_arrays` does; error messages give `remedy`, or `stage`."""
     import safetensors.torch
 
-    return read_safetensors(path, safetensors.torch.load_file, stage, remedy)
+    return read_safetensors(path, lambda file: _finite(safetensors.torch.load_file(file)), stage, remedy)

@@ -7,7 +7,6 @@ Everything here is plain Python, because options and paths are checked before an
 """
 
 import errno
-import io
 import json
 import math
 import os
@@ -141,14 +140,6 @@ def read_bytes(path: Path | str, most: int) -> bytes:
 def open_ordinary(path: Path | str) -> IO[bytes]:
     """Open an ordinary file for reading. The path may be a link, since it is the user who names it."""
     return os.fdopen(open_handle(path, os.O_RDONLY, follow_link=True), "rb")
-
-
-def short_lines(file: io.TextIOWrapper, most: int) -> Iterator[str]:
-    """The lines of a text, for readers of csv, which hold a line in memory many times over."""
-    while line := file.readline(most):
-        if len(line) == most:
-            raise ValueError(f"a line has more than {most:,} characters")
-        yield line
 
 
 def open_archive(file: IO[bytes]) -> zipfile.ZipFile:

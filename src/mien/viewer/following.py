@@ -2,13 +2,13 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from mien.viewer.meters import Meters
 from mien.viewer.session import Seen, Session
 
 if TYPE_CHECKING:
@@ -25,6 +25,60 @@ _WORDS = {
     "following": "Following.",
     "resting": "The face is away, so the avatar rests.",
 }
+
+
+_KEPT_SECONDS = 5.0
+"""Time over which the rate that people see now is taken."""
+
+
+class Meters:
+    """Frames a second of each stage, and the time from a frame to its picture. Any thread may use it."""
+
+    def __init__(self) -> None:
+        """Count from zero."""
+        self._lock = threading.Lock()
+        self._recent = {stage: deque[float](maxlen=1000) for stage in STAGES}
+        self._whole = dict.fromkeys(STAGES, (0, 0.0, 0.0))
+        """Number of frames, and the times of the first and of the last."""
+        self._delays = deque[float](maxlen=100_000)
+
+    def count(self, stage: str, now: float) -> None:
+        """Count a frame of a stage at a time in seconds."""
+        with self._lock:
+            count, first, _ = self._whole[stage]
+            self._whole[stage] = count + 1, first if count else now, now
+            self._recent[stage].append(now)
+
+    def delay(self, seconds: float) -> None:
+        """Note the time from a frame that came in to its picture that went out."""
+        with self._lock:
+            self._delays.append(seconds)
+
+    def rates(self, now: float | None = None) -> dict[str, float]:
+        """Frames a second of each stage: of the last seconds before `now`, or (None) of the whole time."""
+        with self._lock:
+            if now is None:
+                whole = self._whole.items()
+                return {name: (n - 1) / (last - first) if n > 1 else 0.0 for name, (n, first, last) in whole}
+            begin = now - _KEPT_SECONDS
+            return {name: sum(begin < at for at in recent) / _KEPT_SECONDS for name, recent in self._recent.items()}
+
+    def delays(self) -> tuple[float, float, int]:
+        """Median and 95th percentile of the delays in seconds, and their number. They are NaN without any."""
+        with self._lock:
+            delays = np.array(self._delays)
+        if not len(delays):
+            return float("nan"), float("nan"), 0
+        return float(np.median(delays)), float(np.percentile(delays, 95)), len(delays)
+
+    def words(self, now: float | None = None) -> list[str]:
+        """Lines for people with the rates and the delays."""
+        rates = ", ".join(f"{stage} {rate:.1f}" for stage, rate in self.rates(now).items())
+        median, late, count = self.delays()
+        lines = [f"Frames a second: {rates}"]
+        if count:
+            lines.append(f"From frame in to picture out: median {1e3 * median:.0f} ms, 95 percent {1e3 * late:.0f} ms")
+        return lines
 
 
 class CameraSwitch:
@@ -44,7 +98,7 @@ class CameraSwitch:
         self._stopping = threading.Event()
         self._camera: LiveCamera | None = None
         self._follower: Follower | None = None
-        self.meters = Meters(STAGES)
+        self.meters = Meters()
         self.watch: Callable[[Seen], None] | None = None
         """Is called after each frame that was followed."""
         self.error: BaseException | None = None
