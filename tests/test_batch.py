@@ -159,8 +159,8 @@ def test_what_runs_is_shown_before_a_row_ends(tmp_path: Path, monkeypatch: pytes
 def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Holder):
     batch, (row, *others) = Batch(tmp_path), (stub_row("long"), stub_row("done"), stub_row("failed"))
     batch.write_plan([row, *others])
-    for other in others:
-        batch.write_state(State(other.name, other.name, other.fingerprint, seconds=10.0))
+    batch.write_state(State("done", "done", others[0].fingerprint, seconds=10.0))
+    batch.write_state(State("failed", "failed", others[1].fingerprint, seconds=10.0))
     log = batch.log_file("long")
     log.parent.mkdir(parents=True)
     with mortal.holding(batch.state_file("long")):

@@ -7,8 +7,7 @@ row once and yields each with what the work returned, or with an exception, in t
 import importlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 from mien.batch.plan import Batch, Options, Row, State, Work
 from mien.batch.progress import running_words
 from mien.batch.row import PROGRAM, attempt
-from mien.batch.store import Returned, attempt_in_store
+from mien.batch.store import attempt_in_store
 from mien.disk.files import write_atomically
 from mien.disk.locks import BeingWrittenError, hold, holder_of
 from mien.errors import UserError
@@ -130,25 +129,21 @@ def _attempt(root: Path, program: tuple[str, ...], threads: int | None, row: Row
 
 def _keep(batch: Batch, row: Row, outcome: Any, in_store: bool) -> bool:
     """Keep what a row sent back, and return whether the row is done."""
-    state = outcome
-    if isinstance(outcome, Returned):
-        state = outcome.state
-        for name, content in outcome.files.items():
+    failed = isinstance(outcome, Exception)
+    if failed:
+        before, error = batch.read_state(row.name), " ".join(str(outcome).split())[:500]
+        state = State(row.name, "failed", row.fingerprint, before.tries + 1 if before is not None else 1, error=error)
+    else:
+        state, files = outcome if in_store else (outcome, {})
+        for name, content in files.items():
             place = batch.place(*name.split("/"))
             write_atomically(place, lambda aside, content=content: aside.write_bytes(content))
-    elif isinstance(outcome, Exception):
-        before = batch.read_state(row.name)
-        state = State(row.name, "failed", row.fingerprint, error=" ".join(str(outcome).split())[:500])
-        state = replace(state, tries=before.tries + 1 if before is not None else 1)
-    if in_store and state is not None:
-        batch.write_state(state)
-    elif isinstance(outcome, Exception):
-        try:
-            with hold(batch.state_file(row.name)):
-                if not batch.is_done(row):
-                    batch.write_state(state)
-        except BeingWrittenError:
-            return False
-    if state is not None and state.status == "failed":
+    if state is None:
+        return False
+    if failed or in_store:
+        with suppress(BeingWrittenError), nullcontext() if in_store else hold(batch.state_file(row.name)):
+            if in_store or not batch.is_done(row):
+                batch.write_state(state)
+    if state.status == "failed":
         say(f"{row.name} failed: {state.error}")
-    return state is not None and state.status == "done"
+    return state.status == "done"

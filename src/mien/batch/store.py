@@ -2,8 +2,7 @@
 
 import hashlib
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,19 +42,13 @@ def fetched(word: str, folder: Path) -> str:
     return str(target)
 
 
-@dataclass(frozen=True)
-class Returned:
-    """The state and the files that a row sends back if it ran without the batch's folder."""
-
-    state: State | None
-    files: Mapping[str, bytes]
-    """Its thumbnails and its log: path in the batch's folder -> content."""
-
-
-def attempt_in_store(store: str, program: Sequence[str], threads: int | None, row: Row) -> Returned:
+def attempt_in_store(
+    store: str, program: Sequence[str], threads: int | None, row: Row
+) -> tuple[State | None, dict[str, bytes]]:
     """Run a row in a temporary folder of this machine, with its workspace copied in from a store and out to it.
 
-    The store is the URL of the folder of all workspaces, such as s3://bucket/people.
+    The store is the URL of the folder of all workspaces, such as s3://bucket/people. Returns the row's state, and its
+    thumbnails and log: path in the batch's folder -> content.
     """
     fs, base = store_of(store)
     place = f"{base.rstrip('/')}/{row.name}"
@@ -74,4 +67,4 @@ def attempt_in_store(store: str, program: Sequence[str], threads: int | None, ro
                 if gone.removeprefix(f"{place}/") not in ours:
                     fs.rm_file(gone)
         kept = [*batch.root.glob("thumbs/*"), *batch.root.glob("logs/*")]
-        return Returned(state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept})
+        return state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept}

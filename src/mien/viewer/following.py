@@ -37,8 +37,8 @@ class Meters:
     def __init__(self) -> None:
         """Count from zero."""
         self._lock = threading.Lock()
-        self._recent = {stage: deque[float](maxlen=1000) for stage in STAGES}
-        self._whole = dict.fromkeys(STAGES, (0, 0.0, 0.0))
+        self._recent: dict[str, deque[float]] = {stage: deque(maxlen=1000) for stage in STAGES}
+        self._whole: dict[str, tuple[int, float, float]] = {stage: (0, 0.0, 0.0) for stage in STAGES}
         """Number of frames, and the times of the first and of the last."""
         self._delays = deque[float](maxlen=100_000)
 
