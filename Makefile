@@ -124,12 +124,11 @@ fuzz-native: setup
 	$(BIN)/ninja --quiet -C $(SANITIZED)
 	PYTHONPATH=tests $(BIN)/python -m fuzzing.native_calls $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
 
-# Faults in files of every format and odd command lines, for MINUTES, messages to a viewer, native calls; findings go to out/fuzz/findings.jsonl.
+# Faults in files of every format and odd command lines, for MINUTES, native calls; findings go to out/fuzz/findings.jsonl.
 MINUTES ?= 10
 fuzz: setup
 	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
 	  --findings out/fuzz/findings.jsonl
-	PYTHONPATH=tests $(BIN)/python -m fuzzing.viewer_messages --count 200 --seed $(SEED)
 	$(MAKE) fuzz-native
 
 # FAULTS faults in each layout that `mien import` reads, layouts side by side, without the tests' checks of types at run time, as

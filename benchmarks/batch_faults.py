@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from batch_stub import note, watched
-from mien.batch import Row
-from mien.batch.plan import Batch
+from mien.batch.plan import Batch, Row
 from mien.batch.progress import batch_progress, progress_text
 from mien.batch.row import row_process
 from mien.batch.steps import do_with

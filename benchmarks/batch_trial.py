@@ -22,10 +22,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import mien.batch.drive
 from batch_stub import do_stub, stub_row
-from mien.batch import EngineOptions, Row
-from mien.batch.drive import Driver
-from mien.batch.plan import Batch, State
+from mien.batch.plan import Batch, Options, Row, State
 from mien.batch.results import write_results
 from mien.batch.row import run_row
 
@@ -54,8 +53,8 @@ def work(root: str, row: Row) -> State | None:
 def drive(engine: str, root: Path, address: str) -> None:
     """Be the driver."""
     batch = Batch(root)
-    options = EngineOptions(root, _JOBS, 1, address=address)
-    Driver(batch, engine, options, 2, work=partial(work, str(root.resolve()))).run(batch.read_plan())
+    options = Options(engine, _JOBS, 1, address=address)
+    mien.batch.drive.drive(batch, batch.read_plan(), options, partial(work, str(root.resolve())))
 
 
 def children_named(word: str, root: Path) -> list[int]:

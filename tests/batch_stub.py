@@ -10,13 +10,13 @@ import fcntl
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from mien.batch import EngineOptions, Row
-from mien.batch.drive import Driver
-from mien.batch.plan import Batch
+from mien.batch.drive import drive
+from mien.batch.plan import Batch, Options, Row
 from mien.batch.row import RowFailedError, row_process
 from mien.batch.store import fetched
 from mien.machine.stops import orderly_stops
@@ -83,15 +83,15 @@ def tries(path: Path, name: str) -> int:
     return path.read_text().count(f"begin {name} ") if path.exists() else 0
 
 
-def driver(batch: Batch, retry: int = 1, jobs: int = 2, store: str = "", engine: str = "local") -> Driver:
-    return Driver(batch, engine, EngineOptions(batch.root, jobs, 1), retry, store, PROGRAM)
+def drive_rows(batch: Batch, rows: Sequence[Row], **options: Any) -> None:
+    drive(batch, rows, Options(**{"jobs": 2, "threads": 1, "retry": 1, "program": PROGRAM, **options}))
 
 
 def drive_stubs(root: str) -> None:
     """Run the rows of a plan, as a command does."""
     batch = Batch(Path(root))
     with orderly_stops():
-        driver(batch).run(batch.read_plan())
+        drive_rows(batch, batch.read_plan())
 
 
 def wait_for_begin(root: Path, name: str) -> int:

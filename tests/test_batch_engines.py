@@ -15,9 +15,7 @@ from typing import Any
 
 import pytest
 
-from batch_stub import PROGRAM, stub_row, wait_for_begin
-from mien.batch import EngineOptions
-from mien.batch.drive import Driver
+from batch_stub import drive_rows, stub_row, wait_for_begin
 from mien.batch.plan import Batch
 from mien.batch.progress import batch_progress
 from needs import NO_ENGINE
@@ -49,14 +47,14 @@ def ray_cluster() -> Iterator[Any]:
     cluster.shutdown()
 
 
-def run_with(engine: str, root: Path, rows: list, fault: object = None, **options: object) -> dict[str, float]:
+def run_with(engine: str, root: Path, rows: list, fault: object = None, **options: object) -> dict[str, Any]:
     """Run rows by an engine, with a fault meanwhile, and return the figure of each done row."""
     batch = Batch(root)
     batch.write_plan(rows)
     thread = threading.Thread(target=fault, daemon=True) if callable(fault) else None
     if thread is not None:
         thread.start()
-    Driver(batch, engine, EngineOptions(root, 0, 1, **options), 1, "", PROGRAM).run(rows)  # type: ignore[arg-type]
+    drive_rows(batch, rows, engine=engine, jobs=0, **options)
     states = [batch.read_state(row.name) for row in rows]
     return {state.name: state.runs[0]["psnr"] for state in states if state is not None and state.status == "done"}
 
@@ -121,8 +119,8 @@ def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: An
 
 
 def test_a_row_that_no_node_of_ray_can_hold_fails_alone(tmp_path: Path, ray_cluster: Any, monkeypatch: Any):
-    monkeypatch.setattr("mien.batch.engines.on_ray.LOOK_SECONDS", 0.5)
-    monkeypatch.setattr("mien.batch.engines.on_ray.PATIENCE_SECONDS", 1.0)
+    monkeypatch.setattr("mien.batch.on_ray.LOOK_SECONDS", 0.5)
+    monkeypatch.setattr("mien.batch.on_ray.PATIENCE_SECONDS", 1.0)
     check_too_large("ray", tmp_path, "enough memory", address=ray_cluster.address)
 
 

@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from batch_stub import PROGRAM
-from mien.batch import Row
-from mien.batch.plan import Batch, State
+from mien.batch.plan import Batch, Row, State
 from mien.batch.results import latex_table, markdown_table, means_by, write_results
 from mien.batch.steps import write_strip
 from mien.batch.wall import write_wall

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from mien.camera import Camera, camera_from_fov, camera_from_opengl, look_at
+from mien.camera import Camera, camera_from_fov, look_at
 from mien.capture.cameras.calibration import CalibratedCamera
 from mien.capture.cameras.calibration_check import advise_on, warn_of_misfit
 from mien.capture.cameras.head_path import consensus, find_head_path
@@ -94,15 +94,6 @@ def test_resizing_scales_pixels_and_cropping_shifts_them(viewmat, point, width, 
     if depth.abs() > 1e-3:
         close(resized.project(point)[0], pixel * torch.tensor([width / 640, height / 480], dtype=torch.float64))
         close(camera.cropped(left, top, 10, 20).project(point)[0], pixel - torch.tensor([left, top]))
-
-
-@FEW
-@given(poses, vectors)
-def test_opengl_cameras_look_along_minus_z_with_y_up(T_world_camera: Tensor, point: Tensor) -> None:
-    camera = camera_from_opengl(T_world_camera, camera_of(T_world_camera).K, 640, 480)
-    in_opengl = apply(invert_rigid(T_world_camera), point)
-    close(apply(T_world_camera, in_opengl), point)
-    close(apply(camera.viewmat, point), in_opengl * torch.tensor([1, -1, -1], dtype=torch.float64), 1e-9)
 
 
 @FEW

@@ -1,6 +1,5 @@
 """A package of a stranger adds a method, a format, a dataset and an engine by the recipes in CONTRIBUTING.md."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,11 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from batch_stub import PROGRAM
 from forked import ForkServer
 from fuzzing import uses
 from mien.avatar.methods import METHODS, Method, has_method, method_named, method_names
-from mien.batch.plan import Batch
 from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.datasets import Dataset
@@ -33,8 +30,8 @@ from shared_things import toy_workspace
 from toy_package import blocks, entry_points, help_of, install, mien
 from toy_scene import toy_face_model, toy_sequence
 
-RECIPES = ("Add a method", "Add a format", "Add a dataset", "Add an engine")
-WORDS = ("mesh_points", "xyz", "puppet", "in_turn")
+RECIPES = ("Add a method", "Add a format", "Add a dataset")
+WORDS = ("mesh_points", "xyz", "puppet")
 
 Mien = Callable[..., CompletedProcess[str]]
 workspace = pytest.fixture(toy_workspace)
@@ -145,30 +142,9 @@ def test_footage_is_imported_an_avatar_trained_and_exported(cached: Mien, fork_s
     assert re.search("no method 'mesh_points9'; give one of .*, or install the package that adds it", gone.stderr)
 
 
-def test_an_engine_runs_rows(fork_server: ForkServer, toys: Path, tmp_path: Path) -> None:
-    table = make_table(tmp_path)
-    on = ("batch", table, "--out", str(tmp_path / "out"), "--program", " ".join(PROGRAM), "--on")
-    done = mien(fork_server, toys, *on, "in_turn9")
-    assert done.returncode == 0, done.stderr
-    assert "2 to do on in_turn9" in done.stderr
-    batch = Batch(tmp_path / "out")
-    assert [batch.is_done(row) for row in batch.read_plan()] == [True, True]
-    listed = json.loads(mien(fork_server, toys, "plugins", "--json").stdout)["engines"]
-    assert listed["own"] == ["local", "slurm", "ray"]
-    added = [(each["name"], each["package"], each["fault"]) for each in listed["added"]]
-    assert added == [("in_turn9", "mien-toys", None)]
+def test_help_names_what_packages_add(fork_server: ForkServer, toys: Path) -> None:
     for command, shown in (("train", "textured_mesh, mesh_points9 (compared"), ("export", ".xyz9 files get numbers")):
         assert shown in help_of(fork_server, toys, command)
-    refused = mien(fork_server, toys, *on, "rya")
-    assert refused.returncode == 2
-    assert "no engine 'rya'; give one of local, slurm, ray, in_turn9" in refused.stderr
-
-
-def make_table(folder: Path) -> str:
-    """Write a table of two videos, and return its path."""
-    (folder / "a.mp4").write_bytes(b"a video")
-    (folder / "table.csv").write_text("name,video\nann,a.mp4\nbob,a.mp4\n")
-    return str(folder / "table.csv")
 
 
 FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
@@ -209,10 +185,7 @@ def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
 
 
 DATASET = "from mien.datasets import Dataset\nIT = Dataset({!r}, 'twice', 'avatar', lambda path: {}, print)\n"
-ENGINE = "from mien.batch import Engine\nIT = Engine('mien_none9:run', packages={})\n"
-EXPORT, IMPORT, BATCH = (
-    "export {run} --out {here}/a.none9", "import {here}/F --out {here}/O", "batch {table} --on none9",
-)  # fmt: skip
+EXPORT, IMPORT = "export {run} --out {here}/a.none9", "import {here}/F --out {here}/O"
 METHOD = "from mien.avatar import Method\nIT = Method('mien_none9:Toy', 'mien_none9:TypoConfig')\n"
 TRAIN = "train {run} --method none9 --run new --steps 2"
 WRONG = (
@@ -225,13 +198,7 @@ WRONG = (
     ),
     ("datasets", DATASET.format("none9", "''"), IMPORT, "recognised as gaussian-avatars and none9; choose one with"),
     ("datasets", DATASET.format("none9", "path.no"), IMPORT, "/F: the dataset 'none9' fails (AttributeError("),
-    ("engines", "IT = 1", BATCH, "mien_none9:IT: mien-none9 adds it to mien.engines, and it is no Engine"),
-    (
-        "engines",
-        ENGINE.format("('none8',)"),
-        BATCH,
-        "--on none9: needs the module none8, which is not installed; install",
-    ),
+    ("datasets", "IT = 1", IMPORT + " --dataset none9", "mien-none9 adds it to mien.datasets, and it is no Dataset"),
 )
 
 
@@ -242,12 +209,10 @@ def test_a_package_that_is_wrong_is_named(
     install(tmp_path, "mien_none9", code, f"[mien.{group}]\nnone9 = mien_none9:IT\n")
     (tmp_path / "F").mkdir()
     (tmp_path / "F/point_cloud.ply").touch()
-    table = f"{make_table(tmp_path)} --out {tmp_path / 'O'}"
-    words = line.format(run=workspace, here=tmp_path, table=table).split()
+    words = line.format(run=workspace, here=tmp_path).split()
     done = mien(fork_server, tmp_path, *words)
     assert done.returncode == 2
     assert told in done.stderr
-    assert "none8" not in told or not (tmp_path / "O").exists()
 
 
 @pytest.mark.parametrize("code", ["from mien.formats import NO_SUCH_NAME as IT", "raise SystemExit(3)"])

@@ -16,11 +16,11 @@ from scikit_build_core.build import build_sdist
 from mien.cli import main
 from mien.licences.facts import PACKAGES, PARTS
 from mien.licences.installed import canonical, installed_licences, kind_of
-from mien.licences.spdx import requirements_of, spdx_document
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "release"))
 import make  # noqa: E402  # pyright: ignore[reportMissingImports]
+from sbom import requirements_of, spdx_document  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 
 def test_the_source_distribution_is_small_and_has_what_a_wheel_is_built_from(tmp_path: Path, monkeypatch) -> None:
@@ -94,7 +94,7 @@ def test_every_package_is_named_with_what_brings_it_as_pip_licenses_lists_it(lis
 def test_the_bill_of_materials_is_up_to_date_and_mediapipe_older_than_its_statistics():
     written = json.loads((ROOT / "src/mien/sbom.spdx.json").read_text(encoding="utf-8"))
     expected = spdx_document(PROJECT["version"], requirements_of(PROJECT))
-    assert written == expected, "run: python -m mien.licences pyproject.toml > src/mien/sbom.spdx.json"
+    assert written == expected, "run: python release/sbom.py > src/mien/sbom.spdx.json"
     assert {"numpy", "torch", "mediapipe", "nanobind", "mien"} <= {each["name"] for each in written["packages"]}
     # From 0.10.35 on, mediapipe declares that it sends usage metrics to its maker (docs/platforms.md).
     asked = next(line for line in PROJECT["optional-dependencies"]["create"] if line.startswith("mediapipe"))

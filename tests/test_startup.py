@@ -20,11 +20,11 @@ from mien.avatar.baking import make_portable
 from mien.cli import COMMANDS, main
 from mien.formats.page import write_page
 from mien.formats.shared.packed import pack
-from mien.licences.spdx import requirements_of
 from mien.media.pixels import png_bytes
 from mien.render import camera_paths as torchs
 from mien.runtime import camera_paths
 from refusals import complaint
+from test_release import requirements_of
 from test_runtime import new_avatar
 from toy_scene import toy_camera
 from viewer_alone import page_of
@@ -32,7 +32,7 @@ from web_case import drawn_head
 
 HEAVY = {"torch", "mediapipe", "cv2", "matplotlib", "av", "scipy", "anny", "mien._native"}
 LAZY_ROOMS = [
-    "avatar", "batch", "capture", "datasets", "driving", "face", "formats", "lab.synthetic", "tracking", "training",
+    "avatar", "capture", "datasets", "driving", "face", "formats", "lab.synthetic", "tracking", "training",
     "viewer",
 ]  # fmt: skip
 WITHOUT_TORCH = ("licenses", "plugins", "face-models")

@@ -1,4 +1,4 @@
-"""The pinhole camera, and the only conversions from other camera conventions (docs/conventions.md)."""
+"""The pinhole camera (docs/conventions.md)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mien.rotation import compose_rigid, invert_rigid, rigid_transform
 
-__all__ = ["Camera", "camera_from_fov", "camera_from_opengl", "look_at"]
+__all__ = ["Camera", "camera_from_fov", "look_at"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +79,6 @@ def camera_from_fov(fov_x: float, width: int, height: int, viewmat: Float[Tensor
     focal = 0.5 * width / math.tan(0.5 * fov_x)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(K, torch.eye(4) if viewmat is None else viewmat, width, height)
-
-
-def camera_from_opengl(
-    T_world_camera: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
-) -> Camera:
-    """A camera given by an OpenGL camera-to-world matrix (+x right, +y up, +z backward), as in NeRF data sets."""
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).to(T_world_camera)
-    return Camera(K, invert_rigid(T_world_camera @ flip), width, height)
 
 
 def look_at(

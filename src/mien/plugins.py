@@ -18,28 +18,15 @@ from mien.machine.terminal import tell
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-EXTRA_OF = {
-    "torch": "create",
-    "filelock": "create",
-    "av": "video",
-    "cv2": "create",
-    "mediapipe": "create",
-    "ai_edge_litert": "create",
-    "anny": "create",
-    "stlpips_pytorch": "create",
-    "matplotlib": "create",
-    "PIL": "create",
-    "jinja2": "create",
-    "scipy": "create",
-    "zstandard": "create",
-    "viser": "viewer",
-    "pxr": "usd",
-    "gsplat": "cuda",
-    "submitit": "batch",
-    "ray": "batch",
-    "fsspec": "batch",
-    "s3fs": "batch",
+_EXTRAS = {
+    "video": "av",
+    "create": "torch filelock cv2 mediapipe ai_edge_litert anny stlpips_pytorch matplotlib PIL jinja2 scipy zstandard",
+    "viewer": "viser",
+    "usd": "pxr",
+    "cuda": "gsplat",
+    "batch": "submitit ray fsspec s3fs",
 }
+EXTRA_OF = {module: extra for extra, modules in _EXTRAS.items() for module in modules.split()}
 """Name of a module -> the extra that installs it."""
 PACKAGE_OF = {
     "cv2": "opencv-python-headless",
@@ -58,9 +45,7 @@ _LIBRARY = ": cannot open shared object file"
 def missing_package(error: ImportError, command: str = "") -> str | None:
     """One line about a package that is missing, with the command that installs it. None if it is none of the extras'.
 
-    Args:
-        error: What an import raised.
-        command: The sub-command that runs.
+    `command` is the sub-command that runs.
     """
     module = (error.name or "").partition(".")[0]
     if _LIBRARY in str(error):
@@ -94,10 +79,7 @@ def plugin_names(group: str) -> list[str]:
 def plugin(group: str, name: str, kind: type[_T]) -> _T | None:
     """Return what an installed package adds to a registry under a name; None if none does.
 
-    Args:
-        group: Group of entry points, such as "mien.formats".
-        name: Name of the entry point.
-        kind: Class of the object that the entry point names.
+    The group of entry points is such as "mien.formats". The object that the entry point names is of the class `kind`.
     """
     loaded = _loaded(group, name, kind)
     if isinstance(loaded, UserError):
@@ -146,13 +128,8 @@ def added(group: str, kind: type[_T]) -> list[Added]:
 def with_plugins(group: str, kind: type[_T], own: Sequence[_T], words: Callable[[_T], Iterable[str]]) -> list[_T]:
     """Return a registry: mien's own objects, then those of other packages.
 
-    What `plugin` refuses is left out, with a warning, and so is an object that has a word of one before it.
-
-    Args:
-        group: Group of entry points, such as "mien.formats".
-        kind: Class of the objects.
-        own: Mien's own objects.
-        words: Function that returns the words by which an object is found.
+    What `plugin` refuses is left out, with a warning, and so is an object that has a word of one before it. `words`
+    returns the words by which an object is found.
     """
     found = list(own)
     for name, added in plugins(group, kind).items():

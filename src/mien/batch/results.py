@@ -14,6 +14,7 @@ from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.pages.metric_names import COLUMNS
 
+HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
 HIGHER = {name: higher for name, _, _, higher in COLUMNS}
 DIGITS = {name: digits for name, _, digits, _ in COLUMNS}
 ALIASES = {"lpips": "perceptual", "head_lpips": "head_perceptual"}

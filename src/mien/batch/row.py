@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import mien
-from mien.batch.plan import WORKSPACE, Batch, Row, State, row_from
+from mien.batch.plan import WORKSPACE, Batch, Row, State
+from mien.disk.config import decode
 from mien.disk.inside import open_to_append, open_to_read
 from mien.disk.locks import BeingWrittenError, hold
 from mien.errors import CannotWriteError, UserError
@@ -49,11 +50,7 @@ class RowFailedError(Exception):
 def run_row(batch: Batch, row: Row, do: Do, patience: float = 0.0) -> State | None:
     """Claim a row and run it, unless it is done. Return its state, or None if another process holds the row.
 
-    Args:
-        batch: The batch.
-        row: The row.
-        do: Runs its steps.
-        patience: Seconds to wait for the claim.
+    `patience` has the seconds to wait for the claim.
     """
     until = time.monotonic() + patience
     while True:
@@ -89,12 +86,8 @@ def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int
     """Run a row in a process of its own and wait for it. Return its state.
 
     None if another process holds the row, or if `stop_attempts` stopped it, which then counts as interrupted.
-
-    Args:
-        root: Folder of the batch.
-        row: The row.
-        program: The command of the row's process. The batch's folder follows it.
-        threads: Number of threads of the row's process. None leaves MIEN_THREADS as it is.
+    `program` is the command of the row's process, which the folder of the batch (`root`) follows. Without `threads`,
+    MIEN_THREADS stays as it is.
     """
     batch = Batch(root)
     log = batch.log_file(row.name)
@@ -133,12 +126,7 @@ def stop_attempts() -> None:
 def _concluded(batch: Batch, row: Row, code: int, started: float, printed: int) -> State | None:
     """The state after the row's process has ended. If it could not write one itself, this writes why.
 
-    Args:
-        batch: The batch.
-        row: The row.
-        code: Exit code of its process.
-        started: When the process was started, in seconds since 1970. A failure from before is of an earlier try.
-        printed: Length of the log at that time.
+    A failure from before `started` is of an earlier try. The log had `printed` bytes at that time.
     """
 
     def told(state: State | None) -> bool:
@@ -149,27 +137,19 @@ def _concluded(batch: Batch, row: Row, code: int, started: float, printed: int) 
     found = batch.read_state(row.name)
     if not code and told(found):
         return found  # the row's process wrote it; a lock would double the operations on a shared file system
-    try:
-        with hold(batch.state_file(row.name)):
-            state = batch.read_state(row.name)
-            if not told(state):
-                state = _failed(state, row, started)
-                seconds = round(time.time() - state.began, 2)
-                state = replace(state, seconds=seconds, error=_why(batch, row, code, printed))
-                with suppress(CannotWriteError):  # the disk is full; the engine tells of the state all the same
-                    batch.write_state(state)
+    with suppress(BeingWrittenError), hold(batch.state_file(row.name)):
+        state = batch.read_state(row.name)
+        if told(state):
             return state
-    except BeingWrittenError:
-        return None
-
-
-def _failed(before: State | None, row: Row, started: float) -> State:
-    """The state of a try that its process did not conclude. Perhaps the process had not even claimed the row."""
-    if before is None or before.fingerprint != row.fingerprint:
-        return State(row.name, "failed", row.fingerprint, began=started)
-    if before.began >= started:
-        return replace(before, status="failed")
-    return State(row.name, "failed", row.fingerprint, before.tries + 1, began=started)
+        before = state if state is not None and state.fingerprint == row.fingerprint else None
+        if before is None or before.began < started:  # the process had not even claimed the row
+            before = State(row.name, "failed", row.fingerprint, before.tries + 1 if before else 1, began=started)
+        seconds = round(time.time() - before.began, 2)
+        failed = replace(before, status="failed", seconds=seconds, error=_why(batch, row, code, printed))
+        with suppress(CannotWriteError):  # the disk is full; the engine tells of the state all the same
+            batch.write_state(failed)
+        return failed
+    return None
 
 
 def _why(batch: Batch, row: Row, code: int, printed: int) -> str:
@@ -182,19 +162,14 @@ def _why(batch: Batch, row: Row, code: int, printed: int) -> str:
 
 
 def last_error(log: Path, since: int = 0) -> str:
-    """The last line in which mien reports an error, or the last line if there is none. Empty without a log.
-
-    Args:
-        log: The log.
-        since: Number of bytes at its begin that do not count.
-    """
+    """The last line of a log, after its first `since` bytes, in which mien reports an error; else its last line."""
     lines = [line for line in tail(log, since).splitlines() if line.strip()]
     errors = [line.removeprefix("mien: ") for line in lines if line.startswith("mien: ")]
     return printable((errors or lines or [""])[-1])[:500]
 
 
 def tail(log: Path, since: int = 0) -> str:
-    """The end of a log, without its first `since` bytes."""
+    """The end of a log, without its first `since` bytes. Empty if it cannot be read."""
     try:
         with open_to_read(log) as file:
             file.seek(max(since, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
@@ -205,7 +180,7 @@ def tail(log: Path, since: int = 0) -> str:
 
 def row_process(root: Path, given: IO[str], do: Do) -> int:
     """Be the process of the row that is given as the first line of `given`, and stop when `given` ends."""
-    row = row_from(json.loads(given.readline()))
+    row = decode(Row, json.loads(given.readline()))
     threading.Thread(target=_stop_at_end, args=(given,), daemon=True).start()
     try:
         with orderly_stops():

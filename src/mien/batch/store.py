@@ -1,20 +1,14 @@
-"""Working sets on other machines: inputs by fsspec URLs, and workspaces that are copied in and out of a store."""
+"""Files on other machines by fsspec: inputs by their URLs, and workspaces that are copied in and out of a store."""
 
 import hashlib
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mien.batch.plan import Batch, Row, State
 from mien.batch.row import PROGRAM, attempt
 from mien.errors import UserError
-
-_PART = ".mien-part"
-"""Ending of a file that is being copied to a store."""
-_WHOLE = frozenset({"s3", "gs", "az", "abfs", "memory"})
-"""Stores in which a file appears when it is whole."""
 
 
 def is_url(word: str) -> bool:
@@ -48,23 +42,13 @@ def fetched(word: str, folder: Path) -> str:
     return str(target)
 
 
-@dataclass(frozen=True)
-class Returned:
-    """The state and the files that a row sends back if it ran without the batch's folder."""
-
-    state: State | None
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    """Its thumbnails and its log: path in the batch's folder -> content."""
-
-
-def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> Returned:
+def attempt_in_store(
+    store: str, program: Sequence[str], threads: int | None, row: Row
+) -> tuple[State | None, dict[str, bytes]]:
     """Run a row in a temporary folder of this machine, with its workspace copied in from a store and out to it.
 
-    Args:
-        store: URL of the folder of all workspaces, such as s3://bucket/people.
-        row: The row.
-        program: As for `attempt`.
-        threads: As for `attempt`.
+    The store is the URL of the folder of all workspaces, such as s3://bucket/people. Returns the row's state, and its
+    thumbnails and log: path in the batch's folder -> content.
     """
     fs, base = store_of(store)
     place = f"{base.rstrip('/')}/{row.name}"
@@ -74,26 +58,13 @@ def attempt_in_store(store: str, row: Row, program: Sequence[str] = PROGRAM, thr
         if fs.exists(place):
             workspace.parent.mkdir(parents=True)
             fs.get(place, str(workspace), recursive=True)
-            for path in list(workspace.rglob(f"*{_PART}")):
-                path.unlink()
-        state = attempt(batch.root, row, program, threads)
+        state = attempt(batch.root, row, program or PROGRAM, threads)
         if workspace.is_dir():
-            _copy_out(fs, workspace, place)
+            fs.makedirs(place, exist_ok=True)
+            fs.put(f"{workspace}/", f"{place}/", recursive=True)
+            ours = {path.relative_to(workspace).as_posix() for path in workspace.rglob("*")}
+            for gone in fs.find(place):
+                if gone.removeprefix(f"{place}/") not in ours:
+                    fs.rm_file(gone)
         kept = [*batch.root.glob("thumbs/*"), *batch.root.glob("logs/*")]
-        return Returned(state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept})
-
-
-def _copy_out(fs: Any, workspace: Path, place: str) -> None:
-    """Make the store's copy of a workspace equal to it. A kill in between leaves whole files, old or new."""
-    ours = set()
-    for path in sorted(path for path in workspace.rglob("*") if path.is_file()):
-        target = f"{place}/{path.relative_to(workspace).as_posix()}"
-        fs.makedirs(target.rpartition("/")[0], exist_ok=True)
-        if _WHOLE.isdisjoint([fs.protocol] if isinstance(fs.protocol, str) else fs.protocol):
-            fs.put_file(str(path), target + _PART)
-            fs.mv(target + _PART, target)
-        else:
-            fs.put_file(str(path), target)
-        ours.add(target)
-    for gone in set(fs.find(place)) - ours:
-        fs.rm_file(gone)
+        return state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept}

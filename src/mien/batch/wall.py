@@ -4,25 +4,17 @@ from collections.abc import Sequence
 from typing import Any
 
 from mien.batch.plan import Batch
-from mien.batch.results import DIGITS, HIGHER, paired
+from mien.batch.results import DIGITS, HEADINGS, HIGHER, paired
 from mien.disk.files import write_atomically
 from mien.machine.terminal import counted
-from mien.pages.metric_names import COLUMNS
 from mien.pages.pages import LIVING_PAGE, render
-
-_HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
 
 
 def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
     """Write the page from the entries of the results."""
     shown = [_card(batch, row) for row in rows if row.get("run")]
     shown.sort(key=lambda card: card["figures"].get("psnr", float("-inf")))
-    missing = [
-        {"name": row["name"], "status": row["status"], "error": row.get("error", "")}
-        for row in rows
-        if not row.get("run")
-    ]
-    failed = [row for row in missing if row["status"] == "failed"]
+    failed = [row for row in rows if not row.get("run") and row["status"] == "failed"]
     compared = paired(rows)
     text = render(
         "batch/templates/wall.html",
@@ -31,7 +23,7 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
         cards=shown,
         failed=failed[:200],
         orders=[
-            (name, _HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)
+            (name, HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)
         ],
         comparison=[_compared(entry) for entry in compared],
         several=any("minus" in entry for entry in compared),
@@ -57,7 +49,7 @@ def _card(batch: Batch, row: dict[str, Any]) -> dict[str, Any]:
 
 def _figure(name: str, value: float) -> str:
     """A figure with its name before it and its unit behind it, such as PSNR 25.31 dB."""
-    heading, _, unit = _HEADINGS[name].partition(", ")
+    heading, _, unit = HEADINGS[name].partition(", ")
     return f"{heading} {value:.{DIGITS[name]}f} {unit}".rstrip()
 
 
@@ -68,5 +60,5 @@ def _compared(entry: dict[str, Any]) -> list[str]:
     middle = f"{entry['median']:.{digits}f}" if "median" in entry else ""
     ends = entry.get("interval")
     between = f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}" if ends else ""
-    figure = head + _HEADINGS[entry["metric"].removeprefix("head_")]
+    figure = head + HEADINGS[entry["metric"].removeprefix("head_")]
     return [figure, what, str(entry["rows"]), f"{entry['mean']:.{digits}f}", middle, between]

@@ -6,17 +6,14 @@ import shlex
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from mien.batch.drive import shard_of
-from mien.batch.engines import EngineOptions, engine_named, engine_names
-from mien.batch.plan import Batch
-from mien.commands.parsing.help_text import Described
+from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
+from mien.batch.plan import Batch, Options
 from mien.errors import UserError
 from mien.machine.terminal import show
-from mien.plugins import EXTRA_OF
 
 _WATCH_SECONDS = 5.0
 _TASKS = {
@@ -25,7 +22,7 @@ _TASKS = {
 }
 """Options that a task has. Elsewhere they would change nothing."""
 _OF_ENGINES = ("out", "for_all", "on", "shard", "retry", "jobs", "threads", "program")
-"""Options that a batch has on every engine. `mien.batch.Engine` names others."""
+"""Options that a batch has on every engine. `OPTIONS_OF_ENGINES` names others."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,8 @@ class Command:
     """A csv or json of captures, or a folder of videos. Or a task, and the folder of a batch."""
     out: Path | None = None
     """Folder of the batch, new or existing. Needed to run rows."""
-    on: Annotated[str, Described(lambda: _engines())] = "local"
+    on: Literal["local", "slurm", "ray"] = "local"
+    """What runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
     shard: str = ""
     """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
     retry: int = 2
@@ -92,11 +90,9 @@ class Command:
         if self.out is None:
             raise UserError("--out is missing; give a folder for the batch")
         self._check_given(self.on)
-        for package in engine_named(self.on).packages:
-            if importlib.util.find_spec(package) is None:
-                if package not in EXTRA_OF:
-                    raise UserError(f"--on {self.on}: needs the module {package}, which is not installed; install it")
-                raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+        module = MODULES_OF_ENGINES.get(self.on)
+        if module is not None and importlib.util.find_spec(module) is None:
+            raise ModuleNotFoundError(f"No module named {module!r}", name=module)
         check_writable(self.out, folder=True)
         for name, value in (("retry", self.retry), ("jobs", self.jobs), ("threads", self.threads), ("time", self.time)):
             if not 0 <= value <= 100_000:
@@ -127,7 +123,7 @@ class Command:
 
     def _check_given(self, task: str) -> None:
         """Check that no option is given which the task does not have."""
-        known = _TASKS.get(task) or (*_OF_ENGINES, *engine_named(task).options)
+        known = _TASKS.get(task) or (*_OF_ENGINES, *OPTIONS_OF_ENGINES[task])
         for each in fields(self):
             value, name = getattr(self, each.name), each.name.removeprefix("as_").replace("_", "-")
             name = ", --".join(self.for_all) if each.name == "for_all" and self.for_all else name
@@ -145,7 +141,7 @@ class Command:
             raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 
     def _run_rows(self) -> None:
-        from mien.batch.drive import Driver
+        from mien.batch.drive import drive
         from mien.batch.progress import batch_progress, progress_text
         from mien.batch.results import write_results
         from mien.batch.wall import write_wall
@@ -160,12 +156,11 @@ class Command:
             say(f"labels, which come back in the results: {', '.join(labels)}")
         self._tell_dropped(batch, {row.name for row in rows})
         batch.write_plan(rows)
-        program = self._program()
-        options = EngineOptions(
-            self.out, self.jobs, self.threads, self.gpus, self.time, self.partition, self.ray_address
+        cluster = (self.gpus, self.time, self.partition, self.ray_address)
+        options = Options(
+            self.on, self.jobs, self.threads, *cluster, retry=self.retry, store=self.store, program=self._program()
         )
-        driver = Driver(batch, self.on, options, self.retry, self.store, program)
-        driver.run(shard_of(rows, self.shard) if self.shard else rows)
+        drive(batch, shard_of(rows, self.shard) if self.shard else rows, options)
         write_wall(batch, write_results(batch))
         progress = batch_progress(batch)
         for line in progress_text(progress).splitlines():
@@ -214,8 +209,3 @@ class Command:
         for name, text in (("table.md", markdown_table(table)), ("table.tex", latex_table(table))):
             write_atomically(batch.root / name, lambda aside, text=text: aside.write_text(text, encoding="utf-8"))
         show(json.dumps(table) if self.as_json else markdown_table(table).rstrip())
-
-
-def _engines() -> str:
-    about = "What runs the rows: processes of this machine, a Slurm cluster (submitit), a Ray cluster, or an engine of"
-    return f"{about} another package: {', '.join(engine_names())}."

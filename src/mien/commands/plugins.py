@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Command:
-    """List methods, formats, datasets and engines: mien's own, and those of other packages, with their faults."""
+    """List methods, formats and datasets: mien's own, and those of other packages, with their faults."""
 
     json: bool = False
     """Print an object for programs instead of a list."""
@@ -23,7 +23,6 @@ class Command:
     def run(self) -> None:
         """Print the list."""
         from mien.avatar.methods import METHODS, Method
-        from mien.batch.engines import ENGINES, Engine
         from mien.datasets.dataset import Dataset
         from mien.datasets.registry import datasets
         from mien.formats.format import Format
@@ -34,7 +33,6 @@ class Command:
             "methods": (list(METHODS), added("mien.methods", Method)),
             "formats": ([each.name for each in formats()], added("mien.formats", Format)),
             "datasets": ([each.name for each in datasets()], added("mien.datasets", Dataset)),
-            "engines": (list(ENGINES), added("mien.engines", Engine)),
         }
         rows = {
             group: {"own": _without(names, others), "added": list(map(asdict, others))}

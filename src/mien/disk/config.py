@@ -5,6 +5,7 @@ import difflib
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -90,12 +91,10 @@ COUNT_OR_NONE = Range(0, 100_000)
 def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
     """Check every number of some settings, and of nested settings, against the range beside its field.
 
-    Args:
-        settings: A dataclass.
-        option: Turns the dotted name of a field into the option that sets it: `density.rounds` ->
-            "--method.density.rounds".
+    `option` turns the dotted name of a field into the option that sets it: `density.rounds` ->
+    "--method.density.rounds".
     """
-    hints = get_type_hints(type(settings), include_extras=True)
+    hints = _hints_of(type(settings))
     for field in fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if is_dataclass(value):
@@ -105,12 +104,12 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
         if allowed is not None:
             check_range(value, allowed, option(field.name))
         for mark in marks_of(hint):
-            if isinstance(mark, NotBelow) and value < getattr(settings, mark.other):
-                other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
-                raise UserError(f"{option(field.name)} {shown(value)}: give at least as much as {other}")
-            if isinstance(mark, Above) and value <= getattr(settings, mark.other):
-                other = f"{option(mark.other)} {shown(getattr(settings, mark.other))}"
-                raise UserError(f"{option(field.name)} {shown(value)}: give more than {other}")
+            if isinstance(mark, NotBelow | Above):
+                least, above = getattr(settings, mark.other), isinstance(mark, Above)
+                if value < least or (above and value == least):
+                    asked = "more than" if above else "at least as much as"
+                    other = f"{option(mark.other)} {shown(least)}"
+                    raise UserError(f"{option(field.name)} {shown(value)}: give {asked} {other}")
 
 
 def check_range(value: Any, allowed: Range, option: str) -> None:
@@ -137,6 +136,12 @@ def shown(value: Any) -> str:
 def marks_of(hint: Any) -> tuple[Any, ...]:
     """The marks in a field's type hint, besides its type."""
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+
+
+@cache
+def _hints_of(kind: type) -> dict[str, Any]:
+    """The type hints of a dataclass, with the marks beside them."""
+    return get_type_hints(kind, include_extras=True)
 
 
 def _short(number: float | int) -> str:
@@ -178,7 +183,7 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
         raise UserError(f"{where} {_in_short(changes)}: give an object of settings, {{...}}")
     if changes.get("kind", type(base).__name__) != type(base).__name__:
         raise UserError(f"{where}.kind {_in_short(changes['kind'])}: give {type(base).__name__!r}, or leave it out")
-    hints = get_type_hints(type(base), include_extras=True)
+    hints = _hints_of(type(base))
     known = [f.name for f in fields(base)]
     changed = {}
     for name, change in changes.items():
@@ -203,7 +208,7 @@ def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
 
 def for_loading(settings: Any) -> Any:
     """The same settings, with the smallest values of those that matter only for a new avatar (`ToLoad`)."""
-    hints = get_type_hints(type(settings), include_extras=True)
+    hints = _hints_of(type(settings))
     marks = {name: mark for name, hint in hints.items() for mark in marks_of(hint) if isinstance(mark, ToLoad)}
     return replace(settings, **{name: mark.value for name, mark in marks.items()})
 
@@ -266,7 +271,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 def _decode_dataclass(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: {_in_short(value)} is not a {hint.__name__}")
-    hints = get_type_hints(hint, include_extras=True)
+    hints = _hints_of(hint)
     known = [f.name for f in fields(hint)]
     unknown, missing = set(value) - {*known, "kind"}, [name for name in known if name not in value]
     if unknown or missing:

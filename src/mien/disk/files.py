@@ -10,8 +10,7 @@ import json
 import os
 import secrets
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ import safetensors
 import safetensors.numpy
 
 from mien.disk.inside import open_new, remove_tree
+from mien.disk.reading import expect_whole as expect_whole
 from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import CannotWriteError, UserError
 
@@ -82,8 +82,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Call `write` with a temporary path beside `path`, then rename it to `path`. Readers see either all or nothing.
 
-    Raises:
-        CannotWriteError: the disk is full or read-only, or the folder is not writable.
+    A CannotWriteError says that the disk is full or read-only, or the folder is not writable.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -114,9 +113,6 @@ def replace_folder(path: Path, finished: Path) -> None:
     """Move the folder `finished`, which is on the same disk, to `path`, and remove the folder that was there.
 
     This is a single step if the system can exchange two names. Readers then find either the old folder or the new one.
-
-    Raises:
-        OSError: the folder cannot be moved.
     """
     if not path.exists():
         finished.rename(path)
@@ -148,20 +144,11 @@ def cannot_write(path: Path, error: OSError) -> CannotWriteError:
     return CannotWriteError(f"{path}: cannot be written ({error.strerror or error}); {remedy}", error)
 
 
-@contextmanager
-def expect_whole(path: Path, remedy: str) -> Iterator[None]:
-    """Report errors in the content read from `path` in one line: missing entries, wrong types or sizes."""
-    try:
-        yield
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise UserError(f"{path}: incomplete or damaged ({reason}); {remedy}") from None
-
-
 def write_json(path: Path, format_name: str, version: int, content: Mapping[str, Any]) -> None:
     """Write `content` as json after its `format` and `version`, with a checksum that `read_json` removes again."""
     whole = {"format": format_name, "version": version, **content}
-    text = json.dumps({**whole, _CHECKSUM: _json_checksum(whole)}, indent=1, allow_nan=False)
+    checksum = _json_checksum(json.loads(json.dumps(whole)))
+    text = json.dumps({**whole, _CHECKSUM: checksum}, indent=1, allow_nan=False)
     write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
 
 
@@ -170,8 +157,7 @@ def read_json(
 ) -> dict[str, Any]:
     """Read what `write_json` wrote; error messages name the command `stage` as the remedy.
 
-    `remedy` replaces that advice if the file's folder holds more than the stage can make again in a moment. A missing
-    file still asks for its stage, if there is one.
+    `remedy` replaces that advice. A missing file still asks for its stage, if there is one.
     """
     try:
         content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"))
@@ -188,7 +174,7 @@ def read_json(
             f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {format_name!r} version {version}"
             "; " + (remedy or f"run {stage} again")
         )
-    if _CHECKSUM in content and content.pop(_CHECKSUM) != _canonical_checksum(content):
+    if _CHECKSUM in content and content.pop(_CHECKSUM) != _json_checksum(content):
         remedy = remedy or f"delete its folder and run {stage} again"
         raise UserError(
             f"{path}: was damaged or edited after it was written; {remedy} "
@@ -197,11 +183,7 @@ def read_json(
     return content
 
 
-def _json_checksum(content: Mapping[str, Any]) -> str:
-    return _canonical_checksum(json.loads(json.dumps(content)))
-
-
-def _canonical_checksum(content: Any) -> str:
+def _json_checksum(content: Any) -> str:
     """The checksum of content parsed from json, in which tuples are lists and keys are strings."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:32]
@@ -237,17 +219,25 @@ def write_safetensors(path: Path, data: bytes, metadata: Mapping[str, str] | Non
 
 
 def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
-    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy."""
-    return read_safetensors(path, safetensors.numpy.load_file, stage)
+    """Read safetensors as numpy arrays; error messages name the command `stage` as the remedy.
+
+    No number is infinite. NaN means that a number is not known.
+    """
+    return read_safetensors(path, lambda file: _finite(safetensors.numpy.load_file(file)), stage)
+
+
+def _finite(arrays: Mapping[str, Any]) -> Mapping[str, Any]:
+    for name, array in arrays.items():
+        numbers = np.asarray(array)
+        if numbers.dtype.kind == "f" and np.isinf(numbers).any():
+            raise ValueError(f"{name!r} holds infinite numbers")
+    return arrays
 
 
 def read_safetensors(
     path: Path, load: Callable[[Path], Any], stage: str = _ANY_STAGE, remedy: str | None = None
 ) -> Any:
-    """Read a safetensors file by `load`; a missing or damaged file is reported in one line.
-
-    `remedy` replaces "run `stage` again" in the message.
-    """
+    """Read a safetensors file by `load`; a missing or damaged file is one line, as in `read_json`."""
     if not path.is_file():
         raise UserError(f"{path}: missing; {remedy or f'run {stage} again'}")
     try:
@@ -292,8 +282,8 @@ def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping
     write_safetensors(path, safetensors.torch.save(contiguous), metadata)
 
 
-def read_tensors(path: Path, stage: str = "the stage that writes it", remedy: str | None = None) -> "dict[str, Tensor]":
-    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or else name `stage`."""
+def read_tensors(path: Path, stage: str = _ANY_STAGE, remedy: str | None = None) -> "dict[str, Tensor]":
+    """Read safetensors as torch tensors on the CPU, as `read_arrays` does; error messages give `remedy`, or `stage`."""
     import safetensors.torch
 
-    return read_safetensors(path, safetensors.torch.load_file, stage, remedy)
+    return read_safetensors(path, lambda file: _finite(safetensors.torch.load_file(file)), stage, remedy)

@@ -1,9 +1,7 @@
 """Safe paths inside a folder that a stranger may have filled: names stay in the folder, and nothing leads out of it.
 
 A workspace, a run, a capture or an avatar can come from somebody else, who chose every name in it. The path to the
-folder that the user names may contain links. Below that folder, only files and folders are allowed: `check_tree`
-refuses links, pipes and devices before anything is read or written. Files that are changed in place are opened here as
-well, so that nothing is ever written through a link or through a second name of a file outside.
+folder that the user names may contain links. Below that folder, only ordinary files and folders are allowed.
 """
 
 import os
@@ -45,11 +43,10 @@ def inside(folder: Path, name: object) -> Path:
     return folder / str(name)
 
 
-def check_unlinked(*paths: Path) -> None:
-    """Check that no path is a link. Paths may be missing."""
-    for path in paths:
-        if path.is_symlink():
-            raise UserError(_refusal(path, True))
+def check_unlinked(path: Path) -> None:
+    """Check that a path, which may be missing, is not a link."""
+    if path.is_symlink():
+        raise UserError(_refusal(path, True))
 
 
 def check_tree(folder: Path) -> None:
@@ -80,32 +77,20 @@ def listed(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def open_to_read(path: Path) -> IO[bytes]:
-    """Open a file inside the folder for reading.
-
-    Raises:
-        UserError: it is a link, a folder, a pipe or a device.
-        OSError: it is missing or cannot be read.
-    """
+    """Open a file inside the folder for reading. An OSError says that it is missing or cannot be read."""
     return os.fdopen(_open(path, os.O_RDONLY, alone=False), "rb")
 
 
 def open_to_change(path: Path) -> int:
     """The descriptor of a file inside the folder, opened to change its content. A missing file is created.
 
-    Raises:
-        UserError: it is a link, is not a file, or has a second name, which may be outside the folder.
-        OSError: it cannot be written.
+    Nothing is ever written through a link, or through a second name of a file outside.
     """
     return _open(path, os.O_RDWR | os.O_CREAT, alone=True)
 
 
 def open_to_append(path: Path) -> IO[str]:
-    """Open a text file inside the folder to append to it.
-
-    Raises:
-        UserError: as for `open_to_change`.
-        OSError: it cannot be written.
-    """
+    """Open a text file inside the folder to append to it, with the checks of `open_to_change`."""
     return os.fdopen(_open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, alone=True), "a", encoding="utf-8")
 
 
@@ -113,9 +98,6 @@ def open_new(path: Path) -> IO[bytes]:
     """Create a new, empty file in place of an existing file or link. The target of a link stays as it is.
 
     The process's umask decides who may read and write it.
-
-    Raises:
-        OSError: it cannot be written.
     """
     path.unlink(missing_ok=True)
     return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK | BINARY, 0o666), "w+b")
@@ -130,11 +112,7 @@ def remove_tree(path: Path) -> None:
 
 
 def drop_if_shared(path: Path) -> None:
-    """Remove a link, or a file with a second name, so that a write in place cannot change what is elsewhere.
-
-    Raises:
-        OSError: it cannot be removed.
-    """
+    """Remove a link, or a file with a second name, so that a write in place cannot change what is elsewhere."""
     if path.is_symlink() or (path.exists() and not path.is_dir() and path.stat().st_nlink != 1):
         path.unlink()
 

@@ -1,7 +1,7 @@
-"""Limits on the content of files: sizes of pictures, valid cameras, order of joints. Needs no torch.
+"""Limits on the content of files that others hand over: sizes of pictures, valid cameras, order of joints.
 
-A stranger's file can have correct checksums, too. Its content is checked when it is read, so that no later code meets a
-picture of 10^9 pixels, an index outside its array, or a number that overflows.
+They are checked when a file is read, so that no later code meets a picture of 10^9 pixels, an index outside its array,
+or a number that overflows.
 """
 
 from collections.abc import Sequence
@@ -21,22 +21,14 @@ _RIGID = 1e-2
 
 
 def checked_whole(value: object, low: int, high: int) -> int:
-    """`value`, if it is a whole number from `low` to `high`.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """`value`, if it is a whole number from `low` to `high`; else a ValueError."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise ValueError(f"{value!r:.40} is not a whole number from {low} to {high}")
     return value
 
 
 def checked_side(value: object) -> int:
-    """`value`, if it can be a picture's width or height in pixels.
-
-    Raises:
-        ValueError: it cannot.
-    """
+    """`value`, if it can be a picture's width or height in pixels; else a ValueError."""
     return checked_whole(value, 1, MAX_SIDE)
 
 
@@ -52,13 +44,9 @@ def are_indices(array: np.ndarray, count: int) -> bool:
 
 
 def camera_fault(K: Any, viewmat: Any, width: object, height: object) -> str | None:
-    """The reason why these cannot be a camera (`mien.camera.Camera`), or None if they can.
+    """The reason why these cannot be a camera, or None if they can.
 
-    Args:
-        K: array [3, 3], pixels.
-        viewmat: array [4, 4], world to camera, metres.
-        width: pixels.
-        height: pixels.
+    `K` [3, 3], `width` and `height` are in pixels; `viewmat` [4, 4] goes from the world to the camera, in metres.
     """
     for value in (width, height):
         try:
@@ -95,7 +83,11 @@ def rigid_fault(matrix: Any) -> str | None:
             return "its last column is 0 0 0 1, so it is transposed; put the translation into the last column"
         return f"its last row is {' '.join(f'{value:g}' for value in matrix[3])}; it must be 0 0 0 1"
     turned = matrix[:3, :3]
-    if np.abs(turned).max() > 2 or np.abs(_product(turned) - np.eye(3)).max() > _RIGID or np.linalg.det(turned) < 0:
+    if (
+        np.abs(turned).max() > 2
+        or np.abs((turned[:, None] * turned[None]).sum(-1) - np.eye(3)).max() > _RIGID
+        or np.linalg.det(turned) < 0
+    ):
         return "its upper left 3x3 numbers are not a rotation"
     return None
 
@@ -103,11 +95,6 @@ def rigid_fault(matrix: Any) -> str | None:
 def has_last_row(matrix: np.ndarray) -> bool:
     """Whether the last row of a 4x4 matrix is 0 0 0 1, as in every matrix that maps points to points."""
     return bool(np.abs(matrix[3] - (0, 0, 0, 1)).max() <= _RIGID)
-
-
-def _product(turned: np.ndarray) -> np.ndarray:
-    """`turned` times its transpose."""
-    return (turned[:, None] * turned[None]).sum(-1)
 
 
 def skeleton_fault(names: Sequence[Any], parents: Sequence[Any], free: Sequence[Any]) -> str | None:

@@ -7,13 +7,11 @@ process ends, however it ends, so no lock is ever left over. If another process 
 
 The file is removed with the lock. That is safe, because it is removed only while it is locked, and because a process
 that gets the lock of a removed file starts again. After a kill the file stays, unlocked, and the next process uses it.
-
 The file may come from a stranger together with the workspace: no link is followed, and its content is not trusted.
 
-Readers look at a lock by `mien.machine.system.is_locked`, because they must not create the file, and because two of
-them that look at the same time must not take each other for writers. filelock has no such look.
-
-docs/conventions.md, "Two commands at once", lists which command holds which locks. Readers use `read_beside_writers`.
+Readers use `read_beside_writers`. They look at a lock by `mien.machine.system.is_locked`, because they must not create
+the file, and because two of them that look at the same time must not take each other for writers. filelock has no such
+look. docs/conventions.md, "Two commands at once", lists which command holds which locks.
 """
 
 import errno
@@ -30,7 +28,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from filelock import FileLock, Timeout, lock_descriptor
 
@@ -39,6 +37,7 @@ from mien.disk.reading import open_handle, parse_json
 from mien.errors import CannotWriteError, UserError
 from mien.machine.progress import say
 from mien.machine.system import IS_WINDOWS, SIGNATURE_AT, is_locked, may_live, read_at, write_at
+from mien.machine.terminal import printable
 
 Result = TypeVar("Result")
 
@@ -62,8 +61,6 @@ _PAUSES_SECONDS = (0.0, 0.02, 0.05, 0.1)
 _BEGINNING = b'{"format": "mien.lock"'
 """First bytes of every lock file of mien."""
 _MAX_SIGNATURE_BYTES = 4096
-_MAX_SHOWN = {"host": 60, "since": 30, "command": 200}
-"""Most characters that are shown of each entry about a holder."""
 
 _ours: dict[tuple[int, int], int] = {}
 """Device and number of each lock file that is held -> the process that holds it. A child made by fork has a copy."""
@@ -80,19 +77,14 @@ def hold(*places: Path, remedy: str = WAIT) -> Iterator[None]:
     """Be the only writer of these places (folders or files, which may be missing) while the context lasts.
 
     Missing parent folders are created, and removed again if they stay empty. If the file system has no locks, this
-    warns once and continues.
-
-    Args:
-        places: locked in the order of their names, so that of two processes that want the same places the first gets
-            all.
-        remedy: advice for the message if another process holds a place.
+    warns once and continues. `remedy` is advice for the message if another process holds a place.
 
     Raises:
         BeingWrittenError: another process, or another thread of this one, holds a place.
         CannotWriteError: no lock file can be written beside a place.
     """
     with ExitStack() as stack:
-        for place in sorted(set(places)):
+        for place in sorted(set(places)):  # so that of two processes that want the same places the first gets all
             stack.enter_context(_hold_one(place, remedy))
         yield
 
@@ -112,14 +104,8 @@ def holder_of(place: Path) -> str | None:
 def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], places: Sequence[Path]) -> Result:
     """Return the result of `read`. If it fails because a writer replaced files meanwhile, it is called again.
 
-    Args:
-        read: raises a UserError if files are missing or damaged.
-        folders: the folders that it reads.
-        places: the places that writers of these folders lock.
-
-    Raises:
-        BeingWrittenError: it fails while another process is writing there.
-        UserError: it fails for another reason.
+    It reads these folders, whose writers lock these places. If one of them holds a lock when it fails for the last
+    time, a BeingWrittenError says so.
     """
     for pause in (*_PAUSES_SECONDS, None):
         before = [_state(folder) for folder in folders]
@@ -176,7 +162,9 @@ def _acquire(place: Path, file: Path, remedy: str) -> Callable[[], None]:
                 raise _being_written(place, holder or _NAMELESS, remedy) from None
         except OSError as error:
             if error.errno in _NO_LOCKS:
-                _warn_of_no_locks(file)
+                if "no locks" not in said_once:
+                    said_once.add("no locks")
+                    say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
                 return lambda: None
             if error.errno not in _REMOVED or time.monotonic() >= patience:
                 raise
@@ -188,7 +176,6 @@ def _lock(file: Path) -> Callable[[], None]:
 
     Raises:
         Timeout: another process, or another thread of this one, has locked the file.
-        UserError: it is not a lock file.
         OSError: it cannot be opened or locked, or it was removed meanwhile.
     """
     with suppress(FileNotFoundError):
@@ -249,20 +236,17 @@ def _holder(file: Path, *, ours: bool = True) -> str | None:
     try:
         if not ours and _ours.get(_identity(os.fstat(handle))) == os.getpid():
             return None
-        return _wait_for_name(handle) if is_locked(handle) else None
+        if not is_locked(handle):
+            return None
+        for _ in range(round(PATIENCE_SECONDS / 2 / _STEP_SECONDS)):
+            if (holder := _read_holder(handle)) is not None:
+                return holder
+            time.sleep(_STEP_SECONDS)
+        return _NAMELESS
     except OSError:
         return None
     finally:
         os.close(handle)
-
-
-def _wait_for_name(handle: int) -> str:
-    for _ in range(round(PATIENCE_SECONDS / 2 / _STEP_SECONDS)):
-        holder = read_holder(handle)
-        if holder is not None:
-            return holder
-        time.sleep(_STEP_SECONDS)
-    return _NAMELESS
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:
@@ -283,12 +267,6 @@ def _state(folder: Path) -> object:
     return _identity(own), sorted((name, *_identity(each), each.st_mtime_ns, each.st_size) for name, each in files)
 
 
-def _warn_of_no_locks(file: Path) -> None:
-    if "warned" not in said_once:
-        said_once.add("warned")
-        say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
-
-
 def _sign(handle: int, file: Path) -> None:
     """Write into an open lock file that this process holds it, with pid, host, time and command line."""
     found = read_at(handle, len(_BEGINNING), SIGNATURE_AT)
@@ -298,9 +276,9 @@ def _sign(handle: int, file: Path) -> None:
     about = {
         "format": "mien.lock",
         "pid": os.getpid(),
-        "host": socket.gethostname()[: _MAX_SHOWN["host"]],
+        "host": socket.gethostname()[:60],
         "since": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
-        "command": command[: _MAX_SHOWN["command"] + 1],
+        "command": command[:200],
     }
     text = json.dumps(about).encode()
     with suppress(OSError):  # a full disk, or another user's file: the lock holds even without a signature
@@ -308,35 +286,16 @@ def _sign(handle: int, file: Path) -> None:
         write_at(handle, text, SIGNATURE_AT)
 
 
-def read_holder(handle: int) -> str | None:
-    """The holder of an open lock file, described in one line. The content of the file is not trusted.
+def _read_holder(handle: int) -> str | None:
+    """The holder of an open lock file, described in one line of limited length. The content of the file is not trusted.
 
     The result is None if the file names no process, or one that has ended: the holder has not signed yet.
     """
-    about = _parsed(read_at(handle, _MAX_SIGNATURE_BYTES, SIGNATURE_AT))
-    if about is None or not _may_live(about):
-        return None
-    words = {name: _shown(about.get(name), longest) for name, longest in _MAX_SHOWN.items()}
-    return f"process {about['pid']} on {words['host']}, since {words['since']}: {words['command']}"
-
-
-def _parsed(text: bytes) -> dict[str, Any] | None:
     try:
-        about = parse_json(text.decode())
-    except ValueError:
+        about = parse_json(read_at(handle, _MAX_SIGNATURE_BYTES, SIGNATURE_AT).decode())
+        pid, host, since, command = (about[name] for name in ("pid", "host", "since", "command"))
+        if not 0 < pid < 1 << 31 or (host == socket.gethostname()[:60] and not may_live(pid)):
+            return None
+    except (ValueError, LookupError, TypeError):
         return None
-    pid = about.get("pid") if isinstance(about, dict) else None
-    return about if isinstance(pid, int) and 0 < pid < 1 << 31 else None
-
-
-def _may_live(about: dict[str, Any]) -> bool:
-    """False if the holder is a process of this machine that has ended."""
-    if about.get("host") != socket.gethostname()[: _MAX_SHOWN["host"]]:
-        return True
-    return may_live(about["pid"])
-
-
-def _shown(text: object, longest: int) -> str:
-    """Untrusted text for a terminal: one line, without control characters, of limited length."""
-    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text)[: longest + 1])
-    return plain if len(plain) <= longest else plain[:longest] + "..."
+    return printable(f"process {pid} on {str(host)[:60]}, since {str(since)[:30]}: {str(command)[:200]}")

@@ -1,19 +1,24 @@
-"""Bounds on what is read: ordinary files of limited size, json with numbers of limited size, pictures of limited size.
+"""Bounds on what is read: ordinary files of limited size, json with numbers of limited size.
+
+After these, and after format, version and checksum (`mien.disk.files`), a reader of mien's own files trusts what mien
+wrote, inside `expect_whole`.
 
 Everything here is plain Python, because options and paths are checked before any heavy library is imported.
 """
 
 import errno
-import io
 import json
 import math
 import os
 import stat
+import struct
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
 
+from mien.errors import UserError
 from mien.machine.system import BINARY, NO_LINK, NO_WAIT
 
 MAX_SIDE = 8192
@@ -37,25 +42,35 @@ _END_OF_LARGE_ARCHIVE = b"PK\x06\x07"
 _MAX_COMMENT_BYTES = 65535
 _MAX_DIRECTORY_BYTES = 1 << 20
 """Largest list of members at the end of an archive, in bytes. Each member takes about 50."""
-_PLAIN_MEMBERS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_STUMBLES = (
+    LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError, EOFError,
+    struct.error,
+)  # fmt: skip
+"""What a reader that trusts a file raises if it is not as mien wrote it."""
 
 
 class NotOrdinaryError(ValueError):
     """A path is not an ordinary file, but a folder, a pipe, a device or a socket, or a link that is not followed."""
 
 
+@contextmanager
+def expect_whole(path: Path, remedy: str) -> Iterator[None]:
+    """Report whatever a reader stumbles over in the content of `path` as one sentence, with what the user can do."""
+    try:
+        yield
+    except _STUMBLES as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise UserError(f"{path}: incomplete or damaged ({reason}); {remedy}") from None
+
+
 def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False, constants: bool = False) -> Any:
-    """The content of a json text. By default, all numbers in it are finite and fit into 64 bits.
+    """The content of a json text; a ValueError says what is wrong with it.
 
     Args:
         text: the text.
         unique_names: whether an object that holds a name twice is refused, for texts that people write.
         any_size: whether numbers of any size are allowed, because the caller checks them and can name their place.
         constants: whether NaN and infinity are allowed, for the same reason.
-
-    Raises:
-        ValueError: the text is not json, or it holds a number or a name that is refused, or lists that are nested too
-            deep, or it would take too much memory.
     """
     if sum(cost * text.count(sign) for sign, cost in _COSTS.items()) > _MAX_PARSED_BYTES:
         raise ValueError("it holds too many lists, objects or numbers")
@@ -76,109 +91,6 @@ def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False,
     raise ValueError(_TOO_DEEP)
 
 
-def read_bytes(path: Path | str, most: int) -> bytes:
-    """The bytes of an ordinary file, which may be reached through a link.
-
-    Raises:
-        ValueError: the file has more than `most` bytes, or is not ordinary.
-        OSError: the file is missing or cannot be read.
-    """
-    handle = open_handle(path, os.O_RDONLY, follow_link=True)
-    try:
-        size = os.fstat(handle).st_size
-        if size > most:
-            raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
-        # Do not read to the end of the file, because the file may grow meanwhile.
-        found = os.read(handle, size)
-        while len(found) < size and (more := os.read(handle, size - len(found))):
-            found += more
-        return found
-    finally:
-        os.close(handle)
-
-
-def open_ordinary(path: Path | str) -> IO[bytes]:
-    """Open an ordinary file for reading. The path may be a link, since it is the user who names it.
-
-    Raises:
-        NotOrdinaryError: it is a folder, a pipe, a device or a socket.
-        OSError: it is missing or cannot be read.
-    """
-    return os.fdopen(open_handle(path, os.O_RDONLY, follow_link=True), "rb")
-
-
-def short_lines(file: io.TextIOWrapper, most: int) -> Iterator[str]:
-    """The lines of a text, for readers of csv, which hold a line in memory many times over.
-
-    Raises:
-        ValueError: a line has `most` characters or more.
-    """
-    while line := file.readline(most):
-        if len(line) == most:
-            raise ValueError(f"a line has more than {most:,} characters")
-        yield line
-
-
-def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
-    """Open a zip archive whose list of members is of moderate size. Its members are checked by `open_member`.
-
-    Raises:
-        ValueError: the list is missing or too long.
-        zipfile.BadZipFile: the archive is damaged.
-    """
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - _MAX_COMMENT_BYTES - _ARCHIVE_END_SIZE))
-    tail = file.read()
-    place = tail.rfind(_ARCHIVE_END)
-    if place < 0 or len(tail) < place + _ARCHIVE_END_SIZE:
-        raise ValueError("its end is missing: copy it again")
-    directory = int.from_bytes(tail[place + 12 : place + 16], "little")
-    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE_ARCHIVE):
-        raise ValueError("it has far more members than such a file")
-    return zipfile.ZipFile(file)
-
-
-def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> zipfile.ZipExtFile:
-    """Open a member of an archive for reading.
-
-    Raises:
-        ValueError: it is encrypted, or compressed in a way that Python may lack.
-    """
-    if member.compress_type not in _PLAIN_MEMBERS:
-        raise ValueError("is compressed in an unusual way")
-    try:
-        return cast(zipfile.ZipExtFile, archive.open(member))
-    except (RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"cannot be unpacked ({str(error)[:_MAX_SHOWN]})") from None
-
-
-def open_handle(path: Path | str, flags: int, *, follow_link: bool) -> int:
-    """The descriptor of an ordinary file. Opening never waits, not even for a process that writes into a pipe.
-
-    Args:
-        path: the file. With `O_CREAT` among the flags, it is created if it is missing.
-        flags: flags of open(2).
-        follow_link: whether the path itself may be a link.
-
-    Raises:
-        NotOrdinaryError: it is a folder, a pipe, a device or a socket, or a link that is not followed.
-        OSError: it is missing or cannot be opened.
-    """
-    try:
-        handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o666)
-    except OSError as error:
-        if error.errno in _NOT_ORDINARY or (error.errno == errno.ELOOP and not follow_link):
-            raise NotOrdinaryError("it is not an ordinary file") from None
-        raise
-    linked = not follow_link and not NO_LINK and Path(path).is_symlink()
-    if linked or not stat.S_ISREG(os.fstat(handle).st_mode):
-        os.close(handle)
-        raise NotOrdinaryError("it is not an ordinary file")
-    return handle
-
-
-_NOT_ORDINARY = frozenset({errno.EISDIR, errno.ENXIO})
-"""Errors of open(2) for folders that are opened to be written, and for sockets and pipes that nobody reads."""
 _TOO_DEEP = "its lists or objects are nested too deep"
 
 
@@ -213,3 +125,68 @@ def _finite_number(digits: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"it holds the number {digits[:_MAX_SHOWN]}")
     return number
+
+
+def read_bytes(path: Path | str, most: int) -> bytes:
+    """The bytes of an ordinary file, which may be reached through a link. A ValueError says that it has too many."""
+    handle = open_handle(path, os.O_RDONLY, follow_link=True)
+    with os.fdopen(handle, "rb") as file:
+        size = os.fstat(handle).st_size
+        if size > most:
+            raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
+        return file.read(size)  # not to its end, because the file may grow meanwhile
+
+
+def open_ordinary(path: Path | str) -> IO[bytes]:
+    """Open an ordinary file for reading. The path may be a link, since it is the user who names it."""
+    return os.fdopen(open_handle(path, os.O_RDONLY, follow_link=True), "rb")
+
+
+def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
+    """Open a zip archive whose list of members is of moderate size. Its members are checked by `open_member`."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - _MAX_COMMENT_BYTES - _ARCHIVE_END_SIZE))
+    tail = file.read()
+    place = tail.rfind(_ARCHIVE_END)
+    if place < 0 or len(tail) < place + _ARCHIVE_END_SIZE:
+        raise ValueError("its end is missing: copy it again")
+    directory = int.from_bytes(tail[place + 12 : place + 16], "little")
+    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE_ARCHIVE):
+        raise ValueError("it has far more members than such a file")
+    return zipfile.ZipFile(file)
+
+
+def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> zipfile.ZipExtFile:
+    """Open a member of an archive for reading, if it is neither encrypted nor compressed as Python may not know."""
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("is compressed in an unusual way")
+    try:
+        return cast(zipfile.ZipExtFile, archive.open(member))
+    except (RuntimeError, NotImplementedError) as error:
+        raise ValueError(f"cannot be unpacked ({str(error)[:_MAX_SHOWN]})") from None
+
+
+def open_handle(path: Path | str, flags: int, *, follow_link: bool) -> int:
+    """The descriptor of an ordinary file. Opening never waits, not even for a process that writes into a pipe.
+
+    Args:
+        path: the file. With `O_CREAT` among the flags, it is created if it is missing.
+        flags: flags of open(2).
+        follow_link: whether the path itself may be a link.
+
+    Raises:
+        NotOrdinaryError: it is a folder, a pipe, a device or a socket, or a link that is not followed.
+        OSError: it is missing or cannot be opened.
+    """
+    try:
+        handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o666)
+    except OSError as error:
+        # EISDIR: a folder that is opened to be written; ENXIO: a socket, or a pipe that nobody reads.
+        if error.errno in (errno.EISDIR, errno.ENXIO) or (error.errno == errno.ELOOP and not follow_link):
+            raise NotOrdinaryError("it is not an ordinary file") from None
+        raise
+    linked = not follow_link and not NO_LINK and Path(path).is_symlink()
+    if linked or not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise NotOrdinaryError("it is not an ordinary file")
+    return handle

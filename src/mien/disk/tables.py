@@ -6,8 +6,6 @@ import json
 from collections.abc import Iterator
 from typing import IO
 
-from mien.disk.reading import short_lines
-
 _MAX_HEADING = 65_536
 """Largest number of characters of the first line that decide what separates the columns."""
 _MAX_LINE = 1 << 20
@@ -17,11 +15,7 @@ _CELL_BYTES, _SHORT_CELL_BYTES, MAX_CELLS_BYTES = 72, 8, 5 << 28
 
 
 def text_of(content: bytes) -> str:
-    """The text of a file: UTF-16 or UTF-32 if it begins with their mark or with their zeros, else UTF-8.
-
-    Raises:
-        ValueError: it is none of these.
-    """
+    """The text of a file: UTF-16 or UTF-32 if it begins with their mark or with their zeros, else UTF-8."""
     try:
         return content.decode(json.detect_encoding(content)).removeprefix("\ufeff")
     except UnicodeDecodeError:
@@ -31,12 +25,7 @@ def text_of(content: bytes) -> str:
 def table_rows(file: IO[bytes] | io.BytesIO) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a csv that are not empty, each with the number of its last line. The first is the heading.
 
-    Args:
-        file: the csv, as for `split_lines`.
-
-    Raises:
-        ValueError: it is no text, or has lines or cells that would take too much memory.
-        csv.Error: it is no csv.
+    A ValueError or csv.Error says that it is no text or no csv, or would take too much memory.
     """
     taken = 0
     for number, row in split_lines(file):
@@ -52,15 +41,8 @@ def table_rows(file: IO[bytes] | io.BytesIO) -> Iterator[tuple[int, list[str]]]:
 def split_lines(file: IO[bytes] | io.BytesIO, most: int = _MAX_LINE) -> Iterator[tuple[int, list[str]]]:
     """Yield all rows of a csv, also empty ones, each with the number of its last line, and close the file.
 
-    Commas, semicolons or tabs separate cells, as in the first line. Excel's hint before it ("sep=;") is no row.
-
-    Args:
-        file: the csv, in an encoding that `text_of` knows.
-        most: most characters of a line.
-
-    Raises:
-        ValueError: it is no text, or a line is longer.
-        csv.Error: it is no csv.
+    Commas, semicolons or tabs separate cells, as in the first line. Excel's hint before it ("sep=;") is no row. A line
+    has at most `most` characters.
     """
     encoding, begun = json.detect_encoding(file.read(4)), False
     file.seek(0)
@@ -69,13 +51,21 @@ def split_lines(file: IO[bytes] | io.BytesIO, most: int = _MAX_LINE) -> Iterator
             lines = iter(lambda: text.readline(_MAX_HEADING), "")
             heading = next((line for line in lines if line.strip() and not _is_hint(line)), "")
             text.seek(0)
-            reader = csv.reader(short_lines(text, most), delimiter=max(",;\t", key=heading.count))
+            reader = csv.reader(_short_lines(text, most), delimiter=max(",;\t", key=heading.count))
             for row in reader:
                 if begun or not row or not _is_hint(row[0]):
                     yield reader.line_num, row
                 begun = begun or bool(row)
     except UnicodeDecodeError:
         raise ValueError(_NO_TEXT) from None
+
+
+def _short_lines(file: io.TextIOWrapper, most: int) -> Iterator[str]:
+    """The lines of a text. csv holds a line in memory many times over."""
+    while line := file.readline(most):
+        if len(line) == most:
+            raise ValueError(f"a line has more than {most:,} characters")
+        yield line
 
 
 def with_point(number: str) -> str:

@@ -110,11 +110,7 @@ def open_workspace(root: Path) -> Workspace:
 
 
 def _check_first_captures(workspace: Workspace) -> None:
-    """Check that a workspace without a sequence is not being made at this moment.
-
-    Raises:
-        BeingWrittenError: another process is capturing its first sequence.
-    """
+    """Check that a workspace without a sequence is not being made at this moment by another process."""
     from mien.disk.locks import AGAIN, check_free  # imports numpy
 
     for file in sorted(workspace.root.glob("sequences/.*.lock")):

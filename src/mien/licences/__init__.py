@@ -1,5 +1,5 @@
 """Licences of everything that is installed beside mien, and of the models and data that mien uses.
 
-`installed_licences` lists packages, `PARTS` what is inside mien's own files and inside packages. `spdx_document` is the
-list of mien's own parts and requirements that each wheel carries. Nothing here is legal advice.
+`installed_licences` lists packages, `PARTS` what is inside mien's own files and inside packages. Nothing here is legal
+advice. `release/sbom.py` makes the SPDX document of mien's wheel from the same facts.
 """

@@ -13,8 +13,6 @@ _ORDER: tuple[Kind, ...] = (
 """From the fewest conditions to the most."""
 _REQUIREMENT = re.compile(r"^\s*([A-Za-z0-9._-]+)\s*(?:\[([^\]]*)\])?")
 _EXTRA = re.compile(r"""extra\s*==\s*['"]([^'"]+)['"]""")
-_APPROVED = "DFSG approved"
-"""A classifier that says who approves of a licence, and not which one it is."""
 _MEANINGS: dict[Kind, str] = {
     "public domain": "no conditions",
     "permissive": "keep its notices when you pass it on",
@@ -74,29 +72,20 @@ def _licence(name: str, package: Distribution, used_for: str) -> Licence:
 
 def _declared(package: Distribution) -> str:
     about = package.metadata
-    if expression := _field(package, "License-Expression"):
-        return expression
+    if "License-Expression" in about:
+        return about["License-Expression"]
     said = [entry.split(" :: ")[-1] for entry in about.get_all("Classifier") or [] if entry.startswith("License ::")]
     said = sorted(entry for entry in said if entry != "OSI Approved")
-    return "; ".join(said) if said else (_field(package, "License") or "UNKNOWN")
-
-
-def _field(package: Distribution, name: str) -> str:
-    """A field of a package's metadata; empty if it has none."""
-    about = package.metadata
-    if name not in about:
-        return ""
-    return about[name]
+    return "; ".join(said) if said else (about["License"] if "License" in about else "") or "UNKNOWN"  # noqa: SIM401
 
 
 def _expression(declared: str, package: Distribution) -> str:
     """The SPDX expression of what is declared. Classifiers side by side all apply."""
-    if _field(package, "License-Expression"):
+    if "License-Expression" in package.metadata:
         return declared
+    first, *others = declared.splitlines()
     parts = []
-    for part in (
-        declared.removeprefix(f"{_APPROVED}; ").split("; ") if "\n" not in declared else [declared.splitlines()[0]]
-    ):
+    for part in [first] if others else first.removeprefix("DFSG approved; ").split("; "):  # tells who approves of it
         word = part.strip()
         parts.append(word if kind_of(word) != "unknown" else WORDS.get(word.lower(), word))
     return " AND ".join(dict.fromkeys(parts))

@@ -32,12 +32,9 @@ def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) ->
 def stream_in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
 ) -> Iterator[Result]:
-    """Yield the function's results for all items, in order.
+    """Yield the function's results for all items, in order. Only a few more items than threads are in memory.
 
-    Args:
-        function: The function.
-        items: The items. They are taken as they are needed: only a few more than threads are in memory.
-        threads: Number of threads. The default is `thread_count`.
+    The default number of threads is `thread_count`.
     """
     threads = threads or thread_count()
     with ThreadPoolExecutor(threads, initializer=_prepare) as pool:

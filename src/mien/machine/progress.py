@@ -15,7 +15,10 @@ from mien.machine.terminal import printable, tell
 _PRIOR_SECONDS = 3.0
 """Weight of the expected times against measured ones, as seconds of measured work."""
 _TRUSTED_SHARE = 0.1
-"""Share of a piece after which its own speed alone tells how long the rest of it takes."""
+"""Share of a piece after which its own speed tells how long the rest of it takes."""
+_PLAIN_INTERVAL_SECONDS, _WHOLE_INTERVAL_SECONDS = 10.0, 60.0
+"""Time between two lines about a bar and about the whole command, if the output is no terminal."""
+_CALLS_BEFORE_ETA = 3
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,6 @@ class Piece:
     """A part of a stage that has a progress bar of its own."""
 
     stage: str
-    """Name of the stage."""
     title: str
     """Beginning of the title of its progress bar."""
     seconds: float
@@ -42,13 +44,17 @@ class Overall:
         self._stages = list(dict.fromkeys(piece.stage for piece in pieces))
         self._at = -1
         self._began, self._first, self._share, self._own = 0.0, 0.0, 1.0, 0.0
-        self._expected, self._measured = _PRIOR_SECONDS, _PRIOR_SECONDS
+        self._expected = self._measured = _PRIOR_SECONDS
+        self._told, self._told_stage = 0.0, 0
 
     def begin(self, title: str, share: float) -> bool:
         """Note that a bar opens with this share done already; return whether it is a piece's."""
-        found = self._find(title)
-        if found is None:
+        # A bar that comes once more, for another part of a clip, is the same piece.
+        own = [index for index, piece in enumerate(self._pieces) if title.startswith(piece.title)]
+        later = [index for index in own if index > self._at]
+        if not later and self._at not in own:
             return False
+        found = later[0] if later else self._at
         # The expected time of a piece counts once, with its first part.
         self._own = self._pieces[found].seconds * (1.0 - share) if found != self._at else 0.0
         self._at, self._began, self._first, self._share = found, self._clock(), share, share
@@ -67,7 +73,13 @@ class Overall:
     def remaining(self) -> float:
         """The expected time to the end of the command, in seconds."""
         pace = self._measured / self._expected
-        return self._rest(pace) + pace * sum(piece.seconds for piece in self._pieces[self._at + 1 :])
+        later = pace * sum(piece.seconds for piece in self._pieces[self._at + 1 :])
+        spent, gained = self._clock() - self._began, self._share - self._first
+        if self._share >= 1.0:
+            return later
+        if gained < _TRUSTED_SHARE:
+            return later + max(pace * self._own - spent, 0.0)
+        return later + spent / gained * (1.0 - self._share)
 
     def stage(self) -> int:
         """Number of the current stage, from 1; 0 before the first."""
@@ -78,31 +90,16 @@ class Overall:
         return self._pieces[self._at].stage if self._at >= 0 else None
 
     def words(self) -> str:
-        """The stage and the remaining time, for people."""
-        number = self.stage()
-        name = self._stages[number - 1] if number else "start"
-        return f"stage {number} of {len(self._stages)} ({name}), {_about(self.remaining())} left of the whole command"
-
-    def short_words(self) -> str:
-        """The same for a place beside a progress bar."""
+        """The stage and the remaining time, beside a progress bar."""
         return f"all: stage {self.stage()} of {len(self._stages)}, {_about(self.remaining())}"
 
-    def _find(self, title: str) -> int | None:
-        """The next piece of this title. A bar that comes once more, for another part of a clip, is the same piece."""
-        own = [index for index, piece in enumerate(self._pieces) if title.startswith(piece.title)]
-        later = [index for index in own if index > self._at]
-        return later[0] if later else self._at if self._at in own else None
-
-    def _rest(self, pace: float) -> float:
-        """The expected time to the end of the current piece: as expected at first, then as measured."""
-        if self._share >= 1.0:
-            return 0.0
-        spent, gained = self._clock() - self._began, self._share - self._first
-        expected = max(pace * self._own - spent, 0.0)
-        if gained <= 0.0:
-            return expected
-        trust = min(gained / _TRUSTED_SHARE, 1.0)
-        return (1.0 - trust) * expected + trust * spent / gained * (1.0 - self._share)
+    def tell_now_and_then(self) -> None:
+        """Print a line at the begin of each stage, and later now and then."""
+        now, stage = time.monotonic(), self.stage()
+        if stage != self._told_stage or now - self._told >= _WHOLE_INTERVAL_SECONDS:
+            self._told, self._told_stage = now, stage
+            left = f"{_about(self.remaining())} left of the whole command"
+            tell(f"stage {stage} of {len(self._stages)} ({self.stage_name() or 'start'}), {left}")
 
 
 def _about(seconds: float) -> str:
@@ -127,35 +124,14 @@ class _Console(Console):
 console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 """The console for people, on standard error, so that standard output stays for results."""
 
-_PLAIN_INTERVAL_SECONDS = 10.0
-_CALLS_BEFORE_ETA = 3
-_WHOLE_INTERVAL_SECONDS = 60.0
-"""Time between two lines about the whole command, if the output is no terminal."""
-
-
-class _Whole:
-    """What progress bars tell about the whole command, of which each bar is a part."""
-
-    def __init__(self, overall: Overall) -> None:
-        self.overall = overall
-        self._told, self._stage = 0.0, 0
-
-    def tell_now_and_then(self) -> None:
-        """Print a line at the begin of each stage, and later now and then."""
-        now, stage = time.monotonic(), self.overall.stage()
-        if stage != self._stage or now - self._told >= _WHOLE_INTERVAL_SECONDS:
-            self._told, self._stage = now, stage
-            tell(self.overall.words())
-
-
-_whole: list[_Whole] = []
+_whole: list[Overall] = []
 """The whole command that runs, if it has said what it will do."""
 
 
 @contextmanager
 def whole_command(overall: Overall) -> Iterator[None]:
     """Show the remaining time of the whole command beside the progress of its parts."""
-    _whole.append(_Whole(overall))
+    _whole.append(overall)
     try:
         yield
     finally:
@@ -164,7 +140,7 @@ def whole_command(overall: Overall) -> Iterator[None]:
 
 def current_stage() -> str | None:
     """The name of the stage that the whole command is in; None if no command has said what it will do."""
-    return _whole[-1].overall.stage_name() if _whole else None
+    return _whole[-1].stage_name() if _whole else None
 
 
 @runtime_checkable  # for beartype, which checks annotations during tests
@@ -180,7 +156,7 @@ class Advance(Protocol):
 def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance]:
     """A bar from `completed` to `total`. If the output is no terminal, it prints a line every ten seconds instead."""
     title = printable(title)
-    whole = _whole[-1] if _whole and _whole[-1].overall.begin(title, completed / max(total, 1)) else None
+    whole = _whole[-1] if _whole and _whole[-1].begin(title, completed / max(total, 1)) else None
     bar = _bar if sys.stderr.isatty() else _plain_progress
     done = completed
     with bar(title, total, completed, whole) as move:
@@ -189,16 +165,16 @@ def progress_bar(title: str, total: int, completed: int = 0) -> Iterator[Advance
             nonlocal done
             done += amount
             if whole is not None:
-                whole.overall.advance(done / max(total, 1))
+                whole.advance(done / max(total, 1))
             move(amount, status)
 
         yield advance
     if whole is not None:
-        whole.overall.end()
+        whole.end()
 
 
 @contextmanager
-def _bar(title: str, total: int, completed: int, whole: _Whole | None) -> Iterator[Advance]:
+def _bar(title: str, total: int, completed: int, whole: Overall | None) -> Iterator[Advance]:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -217,7 +193,7 @@ def _bar(title: str, total: int, completed: int, whole: _Whole | None) -> Iterat
             latest = printable(status) or latest
             bars.update(task, advance=amount)
             if whole is not None:
-                bars.update(task, status="; ".join(filter(None, (latest, whole.overall.short_words()))))
+                bars.update(task, status="; ".join(filter(None, (latest, whole.words()))))
             elif status:
                 bars.update(task, status=latest)
 
@@ -225,7 +201,7 @@ def _bar(title: str, total: int, completed: int, whole: _Whole | None) -> Iterat
 
 
 @contextmanager
-def _plain_progress(title: str, total: int, completed: int, whole: _Whole | None) -> Iterator[Advance]:
+def _plain_progress(title: str, total: int, completed: int, whole: Overall | None) -> Iterator[Advance]:
     if whole is not None:
         whole.tell_now_and_then()
     start = last = first = time.monotonic()

@@ -4,9 +4,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from mien.machine.system import HANGUPS, repeat_signal
 
@@ -56,12 +55,7 @@ class Put:
         return self._number is not None
 
     def follow(self) -> None:
-        """Stop now if that was asked for.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed.
-            Terminated: SIGTERM or SIGHUP has come.
-        """
+        """Stop now if that was asked for: raise a KeyboardInterrupt, or `Terminated`."""
         if self._number is not None:
             raise _KINDS[self._number]
 
@@ -74,12 +68,7 @@ def orderly_stops() -> Iterator[None]:
     code. If the exception is raised where Python can only report it (in a callback of a library), the stop is repeated.
     If a library turns it into an error of its own (while it is imported, for example), that error becomes the stop.
     """
-    if threading.current_thread() is not threading.main_thread():  # signal handlers work only there
-        yield
-        return
-    before = _heard()
     hook = sys.unraisablehook
-
     asked: list[tuple[int, float]] = []
 
     def stop(number: int, frame: object) -> None:
@@ -98,47 +87,44 @@ def orderly_stops() -> Iterator[None]:
         again.daemon = True
         again.start()
 
-    for number in before:
-        signal.signal(number, stop)
-    sys.unraisablehook = repeat
-    try:
-        yield
-    except Exception as error:
-        if asked:
-            raise _KINDS[asked[-1][0]] from error
-        raise
-    finally:
-        sys.unraisablehook = hook
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with _handled_by(stop) as is_handled:
+        if is_handled:
+            sys.unraisablehook = repeat
+        try:
+            yield
+        except Exception as error:
+            if asked:
+                raise _KINDS[asked[-1][0]] from error
+            raise
+        finally:
+            if is_handled:
+                sys.unraisablehook = hook
 
 
 @contextmanager
 def stops_put_off() -> Iterator[Put]:
     """Put Ctrl-C, SIGTERM and SIGHUP off, so that none comes in the middle of a step. They take effect at the end."""
     put = Put()
-    if threading.current_thread() is not threading.main_thread():
+    with _handled_by(put.ask):
         yield put
-        return
-    before = _heard()
-    for number in before:
-        signal.signal(number, put.ask)
-    try:
-        yield put
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     put.follow()
 
 
-def _heard() -> dict[int, Any]:
-    """Return the signals that stop this process, with their present handlers.
+@contextmanager
+def _handled_by(handle: Callable[[int, object], None]) -> Iterator[bool]:
+    """Give the signals that stop this process another handler. Yields False in a thread, where that is not possible.
 
     A shell lets what it starts in the background ignore Ctrl-C. nohup lets a command ignore a closed terminal.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield False
+        return
     handlers = {number: signal.getsignal(number) or signal.SIG_DFL for number in _KINDS}
-    return {
-        number: handler
-        for number, handler in handlers.items()
-        if number == signal.SIGTERM or handler is not signal.SIG_IGN
-    }
+    heard = {n: before for n, before in handlers.items() if n == signal.SIGTERM or before is not signal.SIG_IGN}
+    for number in heard:
+        signal.signal(number, handle)
+    try:
+        yield True
+    finally:
+        for number, before in heard.items():
+            signal.signal(number, before)

@@ -31,11 +31,7 @@ _MIB = 1 << 20
 
 
 def is_locked(handle: int) -> bool:
-    """Whether another open file has the lock of this one. Nothing is created, and no lock stays.
-
-    Raises:
-        OSError: the file system has no locks.
-    """
+    """Whether another open file has the lock of this one. Nothing is created. OSError: the file system has no locks."""
     if sys.platform == "win32":
         # Windows has no shared lock of this kind here, so two that look at the same time meet: look again.
         from filelock import lock_descriptor, unlock_descriptor
@@ -129,11 +125,7 @@ def read_at(handle: int, most: int, offset: int) -> bytes:
 
 
 def write_at(handle: int, data: "bytes | memoryview", offset: int) -> int:
-    """Write bytes into an open file at an offset, and return their number. Its position may change.
-
-    Raises:
-        OSError: the disk is full.
-    """
+    """Write bytes into an open file at an offset, and return their number. Its position may change."""
     if sys.platform == "win32":
         os.lseek(handle, offset, os.SEEK_SET)
         return os.write(handle, data)

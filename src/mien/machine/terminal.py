@@ -22,9 +22,7 @@ _FIRST_BYTE, _LAST_BYTE = "\udc80", "\udcff"
 def printable(text: str, *, lines: bool = False) -> str:
     r"""The text with every control or format character written as an escape such as \x1b or \n.
 
-    Args:
-        text: the text to show.
-        lines: whether line breaks stay as they are. This is for tables, never for messages.
+    With `lines`, line breaks stay as they are. This is for tables, never for messages.
     """
     if text.isprintable():
         return text
@@ -44,13 +42,8 @@ def counted(count: int, noun: str) -> str:
 def show(text: str, *, styled: bool = False) -> None:
     """Print a result, which may have several lines, on standard output.
 
-    Args:
-        text: the result.
-        styled: whether the text has escape sequences of mien. The caller then makes the names in it `printable`.
-
-    Raises:
-        BrokenPipeError: the reader of standard output has closed it.
-        UserError: standard output cannot be written.
+    Text that is `styled` has escape sequences of mien, and its caller makes the names in it `printable`. A
+    BrokenPipeError says that the reader has closed standard output.
     """
     try:
         print(text if styled else printable(text, lines=True), flush=True)

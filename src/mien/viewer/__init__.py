@@ -1,7 +1,6 @@
 """The viewer: an avatar in a browser, drawn by mien's own renderer on the processor.
 
-Session, pictures and the loop that draws know nothing of the browser. Only
-`server.py`, `panel.py` and `messages.py` call viser.
+Session, pictures and the loop that draws know nothing of the browser. Only `server` and `panel` call viser.
 """
 
 import lazy_loader

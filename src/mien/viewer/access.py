@@ -77,12 +77,7 @@ class Door:
         return Door(host, secrets.token_urlsafe(18) if with_token else None)
 
     def answer(self, path: str, headers: Mapping[str, str]) -> Answer | None:
-        """None if a request may go on, or what to answer instead.
-
-        Args:
-            path: The request's path with its query.
-            headers: Its headers, under any capitals.
-        """
+        """None if a request may go on, or what to answer instead. `path` has the query, too."""
         given = {name.lower(): value for name, value in headers.items()}
         host = given.get("host", "")
         origin = given.get("origin")

@@ -61,6 +61,11 @@ class View:
         return runtime.Camera(K, self.viewmat.astype(np.float32), width, height)
 
     @property
+    def is_possible(self) -> bool:
+        """Whether a picture can be drawn of it. A hidden browser window has no size."""
+        return bool(np.isfinite(self.viewmat).all()) and 0 < self.field < math.pi and min(self.width, self.height) > 0
+
+    @property
     def position(self) -> Float[np.ndarray, " 3"]:
         """The camera's centre in world space, in metres."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]

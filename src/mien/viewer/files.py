@@ -43,14 +43,7 @@ def video(
 ) -> bytes:
     """The content of an .mp4: the whole motion of the session, or a turntable of its face, from a view.
 
-    Args:
-        session: The session.
-        view: The view.
-        center: Point that a turntable goes around, in world space, in metres.
-        go_on: Is asked before each frame.
-
-    Raises:
-        Stopped: `go_on` returned False.
+    A turntable goes around `center`, in world space, in metres. `Stopped` is raised when `go_on` returns False.
     """
     from mien.media.writing import write_pictures
 

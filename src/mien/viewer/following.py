@@ -2,19 +2,19 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from mien.viewer.meters import Meters
 from mien.viewer.session import Seen, Session
 
 if TYPE_CHECKING:
-    import mien.capture.person.faces
-    import mien.driving.live.follower
-    import mien.media.live_camera
+    from mien.capture.person.faces import LandmarkDetector
+    from mien.driving.live.follower import Follower
+    from mien.media.live_camera import LiveCamera, LiveFrame
 
 STAGES = ("camera", "tracking", "drawing")
 _PATIENCE_SECONDS = 0.04
@@ -27,31 +27,78 @@ _WORDS = {
 }
 
 
+_KEPT_SECONDS = 5.0
+"""Time over which the rate that people see now is taken."""
+
+
+class Meters:
+    """Frames a second of each stage, and the time from a frame to its picture. Any thread may use it."""
+
+    def __init__(self) -> None:
+        """Count from zero."""
+        self._lock = threading.Lock()
+        self._recent: dict[str, deque[float]] = {stage: deque(maxlen=1000) for stage in STAGES}
+        self._whole: dict[str, tuple[int, float, float]] = {stage: (0, 0.0, 0.0) for stage in STAGES}
+        """Number of frames, and the times of the first and of the last."""
+        self._delays = deque[float](maxlen=100_000)
+
+    def count(self, stage: str, now: float) -> None:
+        """Count a frame of a stage at a time in seconds."""
+        with self._lock:
+            count, first, _ = self._whole[stage]
+            self._whole[stage] = count + 1, first if count else now, now
+            self._recent[stage].append(now)
+
+    def delay(self, seconds: float) -> None:
+        """Note the time from a frame that came in to its picture that went out."""
+        with self._lock:
+            self._delays.append(seconds)
+
+    def rates(self, now: float | None = None) -> dict[str, float]:
+        """Frames a second of each stage: of the last seconds before `now`, or (None) of the whole time."""
+        with self._lock:
+            if now is None:
+                whole = self._whole.items()
+                return {name: (n - 1) / (last - first) if n > 1 else 0.0 for name, (n, first, last) in whole}
+            begin = now - _KEPT_SECONDS
+            return {name: sum(begin < at for at in recent) / _KEPT_SECONDS for name, recent in self._recent.items()}
+
+    def delays(self) -> tuple[float, float, int]:
+        """Median and 95th percentile of the delays in seconds, and their number. They are NaN without any."""
+        with self._lock:
+            delays = np.array(self._delays)
+        if not len(delays):
+            return float("nan"), float("nan"), 0
+        return float(np.median(delays)), float(np.percentile(delays, 95)), len(delays)
+
+    def words(self, now: float | None = None) -> list[str]:
+        """Lines for people with the rates and the delays."""
+        rates = ", ".join(f"{stage} {rate:.1f}" for stage, rate in self.rates(now).items())
+        median, late, count = self.delays()
+        lines = [f"Frames a second: {rates}"]
+        if count:
+            lines.append(f"From frame in to picture out: median {1e3 * median:.0f} ms, 95 percent {1e3 * late:.0f} ms")
+        return lines
+
+
 class CameraSwitch:
     """Follows a camera while it is on. Methods may be called from any thread."""
 
     def __init__(
         self,
         session: Session,
-        open_camera: Callable[[], "mien.media.live_camera.LiveCamera"],
-        make: Callable[[], "mien.driving.live.follower.Follower"],
+        open_camera: Callable[[], "LiveCamera"],
+        make: Callable[[], "Follower"],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Prepare to follow; nothing is opened before `start`.
-
-        Args:
-            session: What shows the avatar.
-            open_camera: Returns the camera, not opened yet.
-            make: Returns a new follower.
-            clock: Returns the time in seconds; it is the camera's clock.
-        """
+        """Prepare to follow; nothing is opened before `start`. `clock` is the camera's, in seconds."""
         self._session, self._open, self._make, self._clock = session, open_camera, make, clock
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._camera: mien.media.live_camera.LiveCamera | None = None
-        self._follower: mien.driving.live.follower.Follower | None = None
-        self.meters = Meters(STAGES)
+        self._camera: LiveCamera | None = None
+        self._follower: Follower | None = None
+        self.meters = Meters()
         self.watch: Callable[[Seen], None] | None = None
         """Is called after each frame that was followed."""
         self.error: BaseException | None = None
@@ -111,9 +158,7 @@ class CameraSwitch:
             return ["The camera is away. mien waits for it."]
         return [_WORDS[follower.state], *self.meters.words(self._clock())]
 
-    def _run(
-        self, camera: "mien.media.live_camera.LiveCamera", follower: "mien.driving.live.follower.Follower"
-    ) -> None:
+    def _run(self, camera: "LiveCamera", follower: "Follower") -> None:
         from mien.capture.person.faces import LandmarkDetector
 
         try:
@@ -125,12 +170,7 @@ class CameraSwitch:
             self.error = error
         self.ended = self.error is not None or camera.ended
 
-    def _follow(
-        self,
-        camera: "mien.media.live_camera.LiveCamera",
-        follower: "mien.driving.live.follower.Follower",
-        detector: "mien.capture.person.faces.LandmarkDetector",
-    ) -> None:
+    def _follow(self, camera: "LiveCamera", follower: "Follower", detector: "LandmarkDetector") -> None:
         number, frames, last = -1, 0, None
         while not self._stopping.is_set():
             frame = camera.newest(number, _PATIENCE_SECONDS)
@@ -150,9 +190,9 @@ class CameraSwitch:
 
     def _show(
         self,
-        follower: "mien.driving.live.follower.Follower",
+        follower: "Follower",
         landmarks: Float[np.ndarray, "l 2"] | None,
-        frame: "mien.media.live_camera.LiveFrame",
+        frame: "LiveFrame",
         seconds: float,
     ) -> None:
         height, width = frame.picture.shape[:2]

@@ -54,8 +54,7 @@ class DrawingLoop:
             advance: Is called before each picture with the time. It changes what plays, and returns when it wants to be
                 called again, or None.
             clock: Returns the time in seconds.
-            failed: Is called if a picture cannot be drawn or shown. Its client gets none until something changes, and
-                the others get theirs.
+            failed: Is called if a picture of one client cannot be drawn or shown; it gets none until something changes.
         """
         self._draw, self._advance, self._clock, self._failed = draw, advance, clock, failed
         self._clients: dict[int, _Client] = {}

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,9 +27,6 @@ _NOTHING, _LOADING = "none", "Loading ..."
 _LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
 _MOST_STILLS = 8
 """Number of browsers whose screenshots may wait."""
-MOST_PARTS = 16
-"""Number of messages that a browser may not have taken yet when one more file is made for it. A file has a message for
-each MiB."""
 _FOLLOW_SECONDS = 0.25
 """Time between two moves of the sliders while a motion plays, in seconds."""
 
@@ -51,8 +49,8 @@ class Panel:
             server: The server.
             session: What the controls change.
             title: Name of the avatar, for people and for the files that are saved.
-            view_of: Returns the view of a client.
-            failed: Is called with an exception of slow work, which is a bug.
+            view_of: Returns the view of a client's camera.
+            failed: Is called with an exception of slow work.
             camera: What lets the avatar follow a camera, if there is one.
         """
         self._server, self._session, self._view_of = server, session, view_of
@@ -244,7 +242,8 @@ class Panel:
                     self.move_sliders()
 
     def _add_expressions(self) -> None:
-        gui, portable = self._server.gui, self._session.avatar.portable
+        gui, session = self._server.gui, self._session
+        portable = session.avatar.portable
         bounds = dict(zip(portable.expression_names, portable.expression_bounds, strict=True))
         rest = dict(zip(portable.expression_names, portable.neutral.expression.tolist(), strict=True))
         groups, folders = grouped(portable.expression_names, portable.expression_bounds), {}
@@ -255,7 +254,9 @@ class Panel:
                 with folders[title]:
                     for name in names:
                         low, high = (float(bound) for bound in bounds[name])
-                        self._add_slider(name, readable(name), low, high, rest[name], self._expression_setter(name))
+                        self._add_slider(
+                            name, readable(name), low, high, rest[name], partial(session.set_expression, name)
+                        )
 
         @search.on_update
         async def _(event: Any) -> None:
@@ -265,9 +266,6 @@ class Panel:
                     self.sliders[name].visible = visible
                 folders[title].visible = any(found)
 
-    def _expression_setter(self, name: str) -> Callable[[float], None]:
-        return lambda value: self._session.set_expression(name, value)
-
     def _add_joints(self) -> None:
         gui, avatar = self._server.gui, self._session.avatar
         if not avatar.joint_names:
@@ -276,11 +274,8 @@ class Panel:
             for name, angles in zip(avatar.joint_names, avatar.portable.neutral.joints.tolist(), strict=True):
                 for axis, angle in enumerate(angles):
                     label = f"{readable(name)} {_AXES[axis]}"
-                    setter = self._joint_setter(name, axis)
-                    self._add_slider(f"{name}_{'xyz'[axis]}", label, -MAX_ANGLE, MAX_ANGLE, angle, setter)
-
-    def _joint_setter(self, name: str, axis: int) -> Callable[[float], None]:
-        return lambda value: self._session.set_joint(name, axis, value)
+                    turn = partial(self._session.set_joint, name, axis)
+                    self._add_slider(f"{name}_{'xyz'[axis]}", label, -MAX_ANGLE, MAX_ANGLE, angle, turn)
 
     def _add_slider(
         self, name: str, label: str, low: float, high: float, value: float, take: Callable[[float], None]
@@ -346,9 +341,8 @@ class Panel:
 
     def _photograph(self, client: viser.ClientHandle) -> None:
         """Draw a screenshot and send it."""
-        if self._can_send(client):
-            content = screenshot(self._session, self._view_of(client.camera))
-            client.send_file_download(f"{self._title}.png", content, save_immediately=True)
+        content = screenshot(self._session, self._view_of(client.camera))
+        client.send_file_download(f"{self._title}.png", content, save_immediately=True)
 
     def _record(self, client: viser.ClientHandle) -> None:
         """Write a video and send it."""
@@ -356,8 +350,6 @@ class Panel:
         def go_on() -> bool:
             return not self._stopping and client.client_id in self._server.get_clients()
 
-        if not self._can_send(client):
-            return
         note = client.add_notification("Video", "It is being written ...", loading=True, with_close_button=False)
         try:
             content = video(self._session, self._view_of(client.camera), center_of(self._session.avatar), go_on)
@@ -368,14 +360,6 @@ class Panel:
             self._complain(client, str(error))
         finally:
             note.remove()
-
-    def _can_send(self, client: viser.ClientHandle) -> bool:
-        """Whether a client has taken the files before. What it has not taken yet stays in memory."""
-        waiting = client._websock_connection.get_message_buffer().message_from_id
-        if len(waiting) > MOST_PARTS:
-            self._complain(client, "The last file is still on its way; wait for it.")
-            return False
-        return True
 
     def _complain(self, client: viser.ClientHandle | None, message: str) -> None:
         if client is not None:

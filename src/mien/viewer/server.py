@@ -1,6 +1,5 @@
 """The viewer's server: viser shows our pictures behind its controls, and `mien.viewer.access` guards every request."""
 
-import asyncio
 import contextlib
 import errno
 import http.client
@@ -18,7 +17,6 @@ import numpy as np
 import viser
 import viser.transforms
 import websockets.asyncio.server
-from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
@@ -29,22 +27,19 @@ from mien.viewer.access import HEADERS, Door
 from mien.viewer.drawing import View
 from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
-from mien.viewer.messages import MOST_BYTES, Gate
 from mien.viewer.page import adapted
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, center_of
 
 _MOVING_QUALITY, _STILL_QUALITY = 75, 92
 """JPEG qualities of pictures of half size and of full size, 1 to 100."""
-MOST_BROWSERS = 32
-"""Number of browsers that may be connected at a time. Each costs memory, and time of the others."""
 _MOST_TOLD = 10
-"""Number of failures that are told; a browser could cause the same one again and again."""
-_TRY_AGAIN_LATER = 1013
-"""Code with which a WebSocket closes."""
+"""Number of failures that are told; a browser could cause them again and again."""
+_MOST_BYTES = 1 << 16
+"""Largest message of a browser, in bytes. A browser that sends a larger one is disconnected."""
 _CLOSE_SECONDS = 1.0
 """Time that a browser has to answer when its connection is closed, in seconds."""
-_WATCH_SECONDS, _GATE_SECONDS = 0.5, 0.02
+_WATCH_SECONDS = 0.5
 
 
 def serve(
@@ -88,26 +83,22 @@ class Serving:
         listener: socket.socket | None = None,
     ) -> None:
         """Start the server; the arguments are those of `serve`."""
-        self._camera = camera
-        self.door = door
+        self.session, self.door, self._camera = session, door, camera
         self.failures: list[str] = []
-        """The first failures of requests of browsers. Each is a bug, and the viewer goes on."""
+        """The first failures of requests of browsers. The viewer goes on."""
         self._failing = threading.Lock()
-        gate = Gate()
         listener = listener or listen(door.host, port)
         self.port = int(listener.getsockname()[1])
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
-        with _quiet(), _guarded(door, gate, listener):
+        with _quiet(), _guarded(door, listener):
             self.server = viser.ViserServer(host=door.host, port=self.port, label="mien", verbose=False)
         try:
             _check_guard(door.host, self.port)
             # viser could pass this server on through a machine of its makers.
             self.server.request_share_url = lambda verbose=True: None
             self.server.get_event_loop().set_exception_handler(self._task_failed)
-            self.session = session
             self._show(title)
-            gate.open(self.server.gui)
         except BaseException:
             with _quiet():
                 self.server.stop()
@@ -152,21 +143,15 @@ class Serving:
 
     def _failed(self, error: BaseException) -> None:
         """Tell that something could not be done for a browser, and go on for the others."""
-        words = missing_package(error, "view") if isinstance(error, ImportError) else None
-        if words is not None:
-            with self._failing:
-                is_new = words not in self.failures
-                self.failures += [words] * is_new
-            if is_new:
-                tell(f"mien: {words}")
-                for client in self.server.get_clients().values():
-                    client.add_notification("mien", words, color="red")
-            return
-        words = f"{type(error).__name__}: {error}"
+        missing = missing_package(error, "view") if isinstance(error, ImportError) else None
+        words = missing or f"a browser's request failed, and the viewer goes on ({type(error).__name__}: {error})"
         with self._failing:
-            if len(self.failures) < _MOST_TOLD:
-                self.failures.append(words)
-                tell(f"A browser's request failed, which is a bug in mien, and the viewer goes on ({words})")
+            if words in self.failures or len(self.failures) >= _MOST_TOLD:
+                return
+            self.failures.append(words)
+        tell(f"mien: {words}")
+        for client in self.server.get_clients().values() if missing else ():
+            client.add_notification("mien", words, color="red")
 
     def _task_failed(self, loop: Any, context: dict[str, Any]) -> None:
         error = context.get("exception")
@@ -175,6 +160,7 @@ class Serving:
 
     async def _welcome(self, client: viser.ClientHandle) -> None:
         words = client.gui.add_markdown("", order=0.5)
+        first, moved = view_of(client.camera), False
 
         def show(picture: Any, full: bool) -> None:
             quality = _STILL_QUALITY if full else _MOVING_QUALITY
@@ -184,23 +170,21 @@ class Serving:
                 self._camera.shown(seen)
             self.panel.follow()
             if not self.session.playing:
-                view = view_of(client.camera)
-                words.content = self.session.words(view)
-
-        is_first = True
+                words.content = self.session.words(view_of(client.camera))
 
         async def look(camera: viser.CameraHandle) -> None:
-            nonlocal is_first
+            nonlocal moved
             view = view_of(camera)
-            if is_first:
+            moved = moved or not np.array_equal(view.viewmat, first.viewmat)
+            if not moved:
                 # The page has not taken the camera yet that it is told to begin with. Its own is far beside the head.
                 view = replace(view, viewmat=self.session.avatar.camera.viewmat.astype(np.float64))
-            is_first = False
-            if is_possible(view):
+            if view.is_possible:
                 self.loop.look(client.client_id, view)
 
         self.loop.add(client.client_id, show)
         client.camera.on_update(look)
+        await look(client.camera)  # a browser may have waited for the avatar
 
     async def _forget(self, client: viser.ClientHandle) -> None:
         self.loop.remove(client.client_id)
@@ -215,11 +199,6 @@ def view_of(camera: viser.CameraHandle) -> View:
     return View(viewmat, float(camera.fov), int(camera.image_width), int(camera.image_height))
 
 
-def is_possible(view: View) -> bool:
-    """Whether a picture of a view can be drawn. A hidden browser window has no size."""
-    return view.width > 0 and view.height > 0
-
-
 def listen(host: str, port: int) -> socket.socket:
     """Listen at a port, or at a free one if it is 0. Browsers that connect wait until a server takes the socket."""
     try:
@@ -228,7 +207,7 @@ def listen(host: str, port: int) -> socket.socket:
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(place)
-            listener.listen(MOST_BROWSERS)
+            listener.listen()
         except OSError:
             listener.close()
             raise
@@ -262,25 +241,10 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _guarded(door: Door, gate: Gate, listener: socket.socket) -> Iterator[None]:
-    """Let servers that start inside listen at a socket, and ask the door about each request, the gate about messages.
-
-    viser has no place for that.
-    """
+def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
+    """Let servers that start inside listen at a socket, and ask the door about each request. viser cannot do that."""
     module: Any = websockets.asyncio.server
     start = module.serve
-
-    class Connection(ServerConnection):
-        """A connection of a browser, from which only checked messages come."""
-
-        async def recv(self, decode: bool | None = None) -> Any:
-            while True:
-                received = await super().recv(decode)
-                while not gate.is_open:  # a browser that has waited for the avatar may be sooner than the controls
-                    await asyncio.sleep(_GATE_SECONDS)
-                message = gate.checked(received)
-                if message is not None:
-                    return message
 
     def guarded(
         handler: Callable[[Any], Awaitable[None]],
@@ -298,8 +262,8 @@ def _guarded(door: Door, gate: Gate, listener: socket.socket) -> Iterator[None]:
                 response.headers.update(HEADERS)
             return response
 
-        named |= {"create_connection": Connection, "max_size": MOST_BYTES, "close_timeout": _CLOSE_SECONDS}
-        return start(_at_most(MOST_BROWSERS, handler), sock=listener, process_request=process, **named)
+        named |= {"max_size": _MOST_BYTES, "close_timeout": _CLOSE_SECONDS}
+        return start(handler, sock=listener, process_request=process, **named)
 
     module.serve = guarded
     try:
@@ -316,24 +280,6 @@ def _refused(door: Door, request: Request) -> Response | None:
     body = answer.body.encode()
     headers = Headers({**answer.headers, "Content-Length": str(len(body))})
     return Response(answer.status.value, answer.status.phrase, headers, body)
-
-
-def _at_most(most: int, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-    """A handler of connections that closes those beyond a number at once."""
-    connected = 0
-
-    async def handle(connection: Any) -> None:
-        nonlocal connected
-        if connected >= most:
-            await connection.close(_TRY_AGAIN_LATER, "too many browsers look at this viewer")
-            return
-        connected += 1
-        try:
-            await handler(connection)
-        finally:
-            connected -= 1
-
-    return handle
 
 
 def _check_guard(host: str, port: int) -> None:

@@ -63,23 +63,23 @@ class Session:
     def __init__(
         self, avatar: runtime.Avatar, mesh: Mesh | None = None, clips: Mapping[str, Callable[[], Clip]] | None = None
     ) -> None:
-        """Show an avatar at rest.
-
-        Args:
-            avatar: The avatar.
-            mesh: The mesh of its face model, if it is known.
-            clips: Motions by name. Each is loaded at its first use.
-        """
+        """Show an avatar at rest. Each of the motions, which have names, is loaded at its first use."""
         self.avatar, self.mesh = avatar, mesh
         self._makers, self._clips = dict(clips or {}), dict[str, Clip]()
         self._lock, self._drawing = threading.RLock(), threading.Lock()
-        self._face = avatar.face()
+        self.face = avatar.face()
         self._posed: tuple[Face, runtime.Gaussians] | None = None
-        self._version = 0
-        self._clip: Clip | None = None
-        self._chosen: str | None = None
-        self._preset: str | None = None
-        self._timestep = 0
+        self.version = 0
+        self.clip_names = list(self._makers)
+        """Names of the motions that can be chosen."""
+        self.clip: Clip | None = None
+        """The chosen motion."""
+        self.chosen: str | None = None
+        """Its name."""
+        self.preset: str | None = None
+        """The preset face that is shown, alone or with a motion. None after any other change of the face."""
+        self.timestep = 0
+        """The timestep of the motion that is shown."""
         self._playing_since: float | None = None
         """Time at which timestep 0 was due, or None if nothing plays."""
         self._seen: Seen | None = None
@@ -92,44 +92,9 @@ class Session:
         """Is called after each change."""
 
     @property
-    def clip_names(self) -> list[str]:
-        """Names of the motions that can be chosen."""
-        return list(self._makers)
-
-    @property
-    def clip(self) -> Clip | None:
-        """The chosen motion."""
-        return self._clip
-
-    @property
-    def chosen(self) -> str | None:
-        """The name of the chosen motion."""
-        return self._chosen
-
-    @property
-    def timestep(self) -> int:
-        """The timestep of the motion that is shown."""
-        return self._timestep
-
-    @property
     def playing(self) -> bool:
         """Whether the motion plays."""
         return self._playing_since is not None
-
-    @property
-    def preset(self) -> str | None:
-        """The preset face that is shown, alone or with a motion. None after any other change of the face."""
-        return self._preset
-
-    @property
-    def face(self) -> Face:
-        """The face that is shown."""
-        return self._face
-
-    @property
-    def version(self) -> int:
-        """Number of changes so far."""
-        return self._version
 
     def replace_avatar(self, avatar: runtime.Avatar) -> None:
         """Show another state of the same person's avatar. The face stays."""
@@ -143,17 +108,17 @@ class Session:
         index = self.avatar.expression_names.index(name)
         low, high = self.avatar.portable.expression_bounds[index]
         with self._lock:
-            expression = self._face.expression.copy()
+            expression = self.face.expression.copy()
             expression[index] = np.clip(value, low, high)
-            self._take(replace(self._face, expression=expression))
+            self._take(replace(self.face, expression=expression))
 
     def set_joint(self, name: str, axis: int, angle: float) -> None:
         """Set one component of a joint's axis-angle vector, in radians. What plays is paused."""
         _check_finite(name, angle)
         with self._lock:
-            joints = self._face.joints.copy()
-            joints[self.avatar.joint_names.index(name), axis] = angle
-            self._take(replace(self._face, joints=joints))
+            joints = self.face.joints.copy()
+            joints[self.avatar.joint_names.index(name), axis] = np.clip(angle, -math.pi, math.pi)
+            self._take(replace(self.face, joints=joints))
 
     def rest(self) -> None:
         """Show the person at rest."""
@@ -165,8 +130,8 @@ class Session:
         A motion that is chosen keeps it, and goes on if it plays.
         """
         with self._lock:
-            self._preset = preset
-            self._face = self._face_at(self._timestep)
+            self.preset = preset
+            self.face = self._face_at(self.timestep)
             self._change()
 
     def take_random(self, random: np.random.Generator) -> None:
@@ -188,39 +153,39 @@ class Session:
             clip = self._clips[name] if name in self._clips else self._makers[name]()
             self._clips[name] = clip
         with self._lock:
-            self._clip, self._chosen, self._playing_since = clip, name, None
-            self._timestep = 0
-            self.take_preset(self._preset)
+            self.clip, self.chosen, self._playing_since = clip, name, None
+            self.timestep = 0
+            self.take_preset(self.preset)
 
     def seek(self, timestep: int) -> None:
         """Show a timestep of the motion, and pause."""
         with self._lock:
-            if self._clip is not None:
-                self._timestep = min(max(timestep, 0), len(self._clip.motion) - 1)
+            if self.clip is not None:
+                self.timestep = min(max(int(timestep), 0), len(self.clip.motion) - 1)
                 self._playing_since = None
-                self.take_preset(self._preset)
+                self.take_preset(self.preset)
 
     def play(self, playing: bool, now: float) -> None:
         """Play the motion from the timestep that is shown, again and again, or pause it."""
         with self._lock:
-            if self._clip is None or not playing:
+            if self.clip is None or not playing:
                 self._playing_since = None
             else:
-                self._face = self._face_at(self._timestep)
-                self._playing_since = now - self._timestep / self._clip.motion.fps
+                self.face = self._face_at(self.timestep)
+                self._playing_since = now - self.timestep / self.clip.motion.fps
             self._change()
 
     def advance(self, now: float) -> float | None:
         """Go on to the timestep of this moment. Return the time at which the next one is due, or None if none plays."""
         with self._lock:
-            if self._clip is None or self._playing_since is None:
+            if self.clip is None or self._playing_since is None:
                 return None
-            motion = self._clip.motion
+            motion = self.clip.motion
             # Half a microsecond keeps a moment that is due from being rounded to the one before it.
             steps = int((now - self._playing_since) * motion.fps + 5e-7 * motion.fps)
             timestep = steps % len(motion)
-            if timestep != self._timestep:
-                self._timestep, self._face = timestep, self._face_at(timestep)
+            if timestep != self.timestep:
+                self.timestep, self.face = timestep, self._face_at(timestep)
                 self._change()
             return self._playing_since + (steps + 1) / motion.fps
 
@@ -254,19 +219,19 @@ class Session:
     def picture(
         self, view: View, full: bool = True, height: int | None = None, timestep: int | None = None
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture of a view.
+        """The picture of a view, of full size or half of it.
 
         Args:
             view: The view.
-            full: Whether the picture has its full size, or half of it.
+            full: Whether the picture has its full size.
             height: Largest height of a full picture in pixels (default: that of the session).
             timestep: Timestep of the motion to draw (default: the face that is shown).
         """
         with self._lock:
-            face, look, clip, seen = self._face, self.look, self._clip, self._seen
+            face, look, clip, seen = self.face, self.look, self.clip, self._seen
             most, side_by_side = height or self.height, self.side_by_side
             if timestep is None:
-                timestep = self._timestep
+                timestep = self.timestep
             else:
                 assert clip is not None, "there is no motion"
                 face = self._face_at(timestep)
@@ -289,7 +254,7 @@ class Session:
 
     def words(self, view: View) -> str:
         """One line about whether a view shows a side that was filmed."""
-        return words_about_view(self.avatar.portable.filmed, self._face, view)
+        return words_about_view(self.avatar.portable.filmed, self.face, view)
 
     def _gaussians(self, face: Face) -> runtime.Gaussians:
         """The Gaussians of a face. The last ones are kept, because several views show the same face."""
@@ -299,23 +264,23 @@ class Session:
 
     def _take(self, face: Face) -> None:
         with self._lock:
-            self._playing_since, self._preset, self._face = None, None, face
+            self._playing_since, self.preset, self.face = None, None, face
             self._change()
 
     def _face_at(self, timestep: int) -> Face:
         """The face of the motion at a timestep, or the person at rest, with the preset face added."""
-        avatar, face = self.avatar, self.avatar.face() if self._clip is None else self._clip.motion.face(timestep)
-        if self._preset is None:
+        avatar, face = self.avatar, self.avatar.face() if self.clip is None else self.clip.motion.face(timestep)
+        if self.preset is None:
             return face
-        rest, posed = avatar.face(), avatar.face({self._preset: 1.0})
-        if self._clip is None:
+        rest, posed = avatar.face(), avatar.face({self.preset: 1.0})
+        if self.clip is None:
             return posed
         low, high = avatar.portable.expression_bounds.T
         expression = np.clip(face.expression + posed.expression - rest.expression, low, high)
         return replace(face, expression=expression, joints=face.joints + posed.joints - rest.joints)
 
     def _change(self) -> None:
-        self._version += 1
+        self.version += 1
         self.changed()
 
 

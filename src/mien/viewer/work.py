@@ -14,13 +14,7 @@ class Worker:
     """Does one thing at a time, in a thread that does not keep the process from ending."""
 
     def __init__(self, name: str, failed: Callable[[Exception], None], most: int = 1) -> None:
-        """Make a worker whose thread starts with its first work.
-
-        Args:
-            name: Name of the thread.
-            failed: Is called with an exception of the work. The worker goes on.
-            most: Number of works that may wait.
-        """
+        """Make a worker. `failed` takes an exception of the work, after which it goes on; `most` works may wait."""
         self._name, self._failed, self._most = name, failed, most
         self._changed = threading.Condition()
         self._waiting: dict[Hashable, Callable[[], None]] = {}
@@ -28,11 +22,7 @@ class Worker:
         self._thread: threading.Thread | None = None
 
     def ask(self, key: Hashable, work: Callable[[], None]) -> bool:
-        """Do some work soon. It takes the place of work with the same key that still waits.
-
-        Returns:
-            False if too much waits already, or the worker was stopped. The work is not done then.
-        """
+        """Do some work soon, in place of work with the same key that still waits. False if too much waits already."""
         with self._changed:
             full = len(self._waiting) >= self._most and (self._busy or bool(self._waiting))
             if self._stopping or (full and key not in self._waiting):

@@ -9,8 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mien.batch.engines import EngineOptions, Work
-from mien.batch.plan import Row
+from mien.batch.plan import Batch, Options, Row, Work
 from mien.errors import UserError
 
 _LOST_NODES = 3
@@ -25,8 +24,8 @@ _NO_NODE = (
 )
 
 
-def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
-    """Run each row as a task. See `mien.batch.engines`."""
+def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iterator[tuple[Row, Any]]:
+    """Run each row as a task (`mien.batch.drive` says what an engine does)."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
@@ -38,7 +37,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     except Exception as error:  # Ray has no class of its own for this
         why = " ".join(str(error).split())[:300]
         raise UserError(f"Ray cannot be reached or started ({why}); see `ray status`, and --ray-address") from None
-    task = ray.remote(_call)
+    task = ray.remote(lambda work, row: work(row))
     running: dict[Any, Row] = {}
     unfitting: dict[Any, float] = {}
     waiting = list(reversed(rows))
@@ -46,7 +45,11 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
         while waiting or running:
             while waiting and len(running) < (options.jobs or _WAITING):
                 row = waiting.pop()
-                asked = {"num_cpus": options.threads or 2, "num_gpus": options.gpus, "memory": _bytes(row)}
+                asked = {
+                    "num_cpus": options.threads or 2,
+                    "num_gpus": options.gpus,
+                    "memory": round(row.memory_mb * 1e6),
+                }
                 asked |= {"max_retries": _LOST_NODES, "name": f"mien {row.name}"}
                 running[task.options(**asked).remote(work, row)] = row
             ended, _ = ray.wait(list(running), num_returns=1, timeout=LOOK_SECONDS)
@@ -64,11 +67,7 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
         ray.shutdown()
 
 
-def _bytes(row: Row) -> int:
-    return round(row.memory_mb * 1e6)
-
-
-def _never_started(ray: Any, running: dict[Any, Row], since: dict[Any, float], options: EngineOptions) -> list[Any]:
+def _never_started(ray: Any, running: dict[Any, Row], since: dict[Any, float], options: Options) -> list[Any]:
     """The tasks that no node of the cluster has been large enough for, for so long that no new one will come.
 
     Ray would wait for such a node for ever.
@@ -76,14 +75,9 @@ def _never_started(ray: Any, running: dict[Any, Row], since: dict[Any, float], o
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     now, found = time.monotonic(), []
     for task, row in running.items():
-        asked = {"CPU": options.threads or 2, "GPU": options.gpus, "memory": _bytes(row)}
+        asked = {"CPU": options.threads or 2, "GPU": options.gpus, "memory": round(row.memory_mb * 1e6)}
         if any(all(node.get(kind, 0) >= amount for kind, amount in asked.items()) for node in nodes):
             since.pop(task, None)
         elif now - since.setdefault(task, now) >= PATIENCE_SECONDS:
             found.append(task)
     return found
-
-
-def _call(work: Work, row: Row) -> Any:
-    """Do the work of a row on a node."""
-    return work(row)

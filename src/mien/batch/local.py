@@ -1,15 +1,13 @@
 """The engine `local`: processes on this machine that share its threads and its memory."""
 
 import os
-import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed, wait
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mien.batch.engines import EngineOptions, Work
-from mien.batch.plan import Row
+from mien.batch.plan import Batch, Options, Row, Work
 from mien.batch.row import stop_attempts
 from mien.errors import UserError
 
@@ -21,19 +19,17 @@ _STOP_SECONDS = 0.5
 """Seconds between two requests to stop. A row may start after the first one."""
 
 
-def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
-    """Run the rows here, as many at once as jobs and memory allow. See `mien.batch.engines`.
+def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iterator[tuple[Row, Any]]:
+    """Run the rows here, as many at once as jobs and memory allow (`mien.batch.drive` says what an engine does).
 
     Whatever stops this function (Ctrl-C, SIGTERM) stops the rows, too.
     """
-    memory = _Memory(_SHARE * free_memory_mb())
 
     def one(row: Row) -> Any:
-        with memory.taken(row.memory_mb):
-            try:
-                return work(row)
-            except (UserError, OSError) as error:
-                return error
+        try:
+            return work(row)
+        except (UserError, OSError) as error:
+            return error
 
     with ThreadPoolExecutor(jobs_here(rows, options)) as pool:
         futures = {pool.submit(one, row): row for row in rows}
@@ -47,13 +43,12 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
                 stop_attempts()
 
 
-def jobs_here(rows: Sequence[Row], options: EngineOptions) -> int:
-    """How many rows run at once: as asked, or as many as fit the cores (two threads each) and the memory."""
-    if options.jobs:
-        return options.jobs
+def jobs_here(rows: Sequence[Row], options: Options) -> int:
+    """How many rows run at once: as asked, or one for two threads; no more than fit the memory, if all are large."""
     largest = max((row.memory_mb for row in rows), default=1.0)
     fitting = int(_SHARE * free_memory_mb() / max(largest, 1.0))
-    return max(1, min((os.cpu_count() or 1) // (options.threads or 2), fitting, len(rows)))
+    jobs = options.jobs or (os.cpu_count() or 1) // (options.threads or 2)
+    return max(1, min(jobs, fitting, len(rows)))
 
 
 def free_memory_mb() -> float:
@@ -63,23 +58,3 @@ def free_memory_mb() -> float:
         kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
         return int(kilobytes) / 1e3
     return _ASSUMED_MB
-
-
-class _Memory:
-    """Megabytes that rows share. A row that needs more than there are runs alone."""
-
-    def __init__(self, free: float) -> None:
-        self._free, self._taken = free, 0.0
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def taken(self, megabytes: float) -> Iterator[None]:
-        with self._changed:
-            self._changed.wait_for(lambda: not self._taken or self._taken + megabytes <= self._free)
-            self._taken += megabytes
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._taken -= megabytes
-                self._changed.notify_all()

@@ -1,10 +1,13 @@
 """The SPDX 2.3 document of mien's wheel: what is in it, and what it asks for, with licences.
 
 It has no date and no version of what it asks for, because pip chooses these; `mien licenses --json` lists what is
-installed. `python -m mien.licences` prints it for `src/mien/sbom.spdx.json`, which wheels carry (PEP 770).
+installed. `python release/sbom.py > src/mien/sbom.spdx.json` writes what wheels carry (PEP 770).
 """
 
+import json
 import re
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from mien.licences.facts import PACKAGES, PARTS
@@ -112,3 +115,10 @@ def requirements_of(project: dict[str, Any]) -> dict[str, str]:
         for line in lines:
             found.setdefault(canonical(re.split(r"[\s<>=!~;\[]", line, maxsplit=1)[0]), extra)
     return found
+
+
+if __name__ == "__main__":
+    project = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text(encoding="utf-8"))[
+        "project"
+    ]
+    print(json.dumps(spdx_document(project["version"], requirements_of(project)), indent=1))

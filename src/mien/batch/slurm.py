@@ -12,8 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mien.batch.engines import EngineOptions, Work
-from mien.batch.plan import Batch, Row
+from mien.batch.plan import Batch, Options, Row, Work
 from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.machine.progress import say
@@ -44,14 +43,14 @@ class _Task:
         return submitit.helpers.DelayedSubmission(self, rows)
 
 
-def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tuple[Row, Any]]:
-    """Run the rows as job arrays, one for each class of memory. See `mien.batch.engines`."""
-    batch, noted = Batch(options.root), options.root / _NOTED
+def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iterator[tuple[Row, Any]]:
+    """Run the rows as job arrays, one for each class of memory (`mien.batch.drive` says what an engine does)."""
+    noted = batch.root / _NOTED
     numbers, taken = list[str](), list[Row]()
     size = math.ceil(len(rows) / _MOST_TASKS)
     for alike in _by_memory(rows):
         try:
-            numbers.append(_submit(work, alike, options, size))
+            numbers.append(_submit(work, alike, batch, options, size))
         except UserError as error:
             yield from ((row, error) for row in alike)
         else:
@@ -61,11 +60,11 @@ def run(work: Work, rows: Sequence[Row], options: EngineOptions) -> Iterator[tup
     yield from ((row, batch.read_state(row.name)) for row in taken)
 
 
-def wait_for_earlier(root: Path) -> None:
+def wait_for_earlier(batch: Batch) -> None:
     """Wait for the jobs of a driver that has ended before them. Their rows run, so no other driver could take them."""
-    if (root / _NOTED).is_file():
+    if (batch.root / _NOTED).is_file():
         say("waiting for the rows that an earlier command has given to Slurm")
-        _wait(root / _NOTED)
+        _wait(batch.root / _NOTED)
 
 
 def _by_memory(rows: Sequence[Row]) -> list[list[Row]]:
@@ -79,17 +78,17 @@ def _by_memory(rows: Sequence[Row]) -> list[list[Row]]:
     return [found[each] for each in sorted(found)]
 
 
-def _submit(work: Work, rows: Sequence[Row], options: EngineOptions, size: int) -> str:
+def _submit(work: Work, rows: Sequence[Row], batch: Batch, options: Options, size: int) -> str:
     """Submit an array with `size` rows in each task, and return its number."""
     import submitit  # pyright: ignore[reportMissingImports]
     from submitit.core.utils import FailedJobError, FailedSubmissionError  # pyright: ignore[reportMissingImports]
 
-    folder = Batch(options.root).place("slurm")
+    folder = batch.place("slurm")
     folder.mkdir(parents=True, exist_ok=True)
     executor = submitit.SlurmExecutor(folder, max_num_timeout=10)
     executor.update_parameters(
         job_name="mien-batch",
-        time=(options.minutes or _minutes(Batch(options.root))) * size,
+        time=(options.minutes or _minutes(batch)) * size,
         mem=f"{math.ceil(max(row.memory_mb for row in rows))}M",
         cpus_per_task=options.threads or 2,
         gpus_per_task=math.ceil(options.gpus) or None,
