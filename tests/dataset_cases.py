@@ -34,9 +34,8 @@ from mien.disk.limits import camera_fault
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.face.loading import add_face_model
+from mien.face.loading import add_face_model, coefficient_head
 from mien.face.model import Landmarks
-from mien.face.models.coefficients import coefficient_head
 from mien.face.models.flame import flame_face_model, read_flame
 from mien.media.video import read_video_frames, write_video
 from mien.pipeline import import_dataset as import_footage

@@ -10,9 +10,8 @@ import torch
 from gnm_like import gnm_like, posed_as_gnm, write_gnm
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.models.gnm import gnm_face_model, read_gnm
-from mien.face.models.ict import NEUTRAL, PACKED_KEYS, read_ict
+from mien.face.models.ict import NEUTRAL, PACKED_KEYS, read_ict, read_obj, read_obj_positions
 from mien.face.models.model_files import default_name, read_model_file
-from mien.face.models.obj_files import read_obj, read_obj_positions
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from refusals import refuses
 
@@ -68,7 +67,7 @@ GNM_FAULTS = {
     "a key": (lambda a: {"skinning_weights": None}, "has no 'skinning_weights'"),
     "a shape": (lambda a: {"expression_basis": a["expression_basis"][:, 1:]}, "'expression_basis' is .*download"),
     "not finite": (lambda a: {"vertex_identity_basis": a["vertex_identity_basis"] * np.nan}, "not finite"),
-    "an index": (lambda a: {"triangles": a["triangles"] + 4535}, "an index that is no vertex"),
+    "an index": (lambda a: {"triangles": a["triangles"] + 4535}, "has the index 9069"),
     "other joints": (lambda a: {"joint_names": np.array(["a", "b", "c", "d"])}, "GNM Head has neck, head"),
     "a chain": (lambda a: {"joint_parent_indices": np.array([-1, 0, 0, 1])}, "'joint_parent_indices'"),
     "a group": (lambda a: {"vertex_group_names": np.array([f"x{n}" for n in range(9)])}, "no group"),

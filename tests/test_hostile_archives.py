@@ -37,7 +37,7 @@ def test_a_pickle_takes_no_more_than_its_own_size(tmp_path: Path, monkeypatch: p
     refused(read_flame, path, "too many for a face model", 24 * MIB)
     for data in SMALL_PICKLES.values():
         path.write_bytes(data)
-        refused(read_flame, path, r"is not a pickle, or is damaged|has no 'v_template'|not named arrays", 24 * MIB)
+        refused(read_flame, path, r"cannot be read as a pickle|has no 'v_template'", 24 * MIB)
     monkeypatch.setattr(inert_pickle, "MAX_MODEL_BYTES", 8 * MIB)
     one = np.zeros(MIB // 8)
     path.write_bytes(pickle.dumps({f"name{i}": one for i in range(20)}, protocol=2))

@@ -1,6 +1,6 @@
 """Sequences with poses and coefficients of a head model that is not published.
 
-They get a head that the coefficients do not move (`mien.face.models.coefficients`). The poses are in that model's own
+They get a head that the coefficients do not move (`mien.face.loading`). The poses are in that model's own
 axes and unit. One turn, one shift and one scale lead to them from mien's head frame. They are found by landmarks.
 """
 
@@ -18,8 +18,8 @@ from mien.datasets.dataset import FilmedSequence, ReadSequence, TrackedSequence
 from mien.datasets.flame_poses import AXES, FRONT, axis_angles, camera_of
 from mien.datasets.sequences import tracked_sequence
 from mien.errors import UserError
+from mien.face.loading import coefficient_count
 from mien.face.model import FaceModel
-from mien.face.models.coefficients import coefficient_count
 
 Place = tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]
 """Turn R, scale s and shift d of mien's head in the axes of other poses: x -> s R x + d."""

