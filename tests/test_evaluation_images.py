@@ -21,8 +21,8 @@ from mien.evaluation.image_folders import ImageFolders, read_crops, score_folder
 from mien.evaluation.metrics import l1, psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report.text import protocol_lines
 from mien.evaluation.scoring import ScoreSettings
+from mien.evaluation.text import protocol_lines
 from mien.media.video import write_video
 from mien.tracking.scoring import Scoring
 from plain_settings import plain_config, plain_run

@@ -26,8 +26,8 @@ from mien.evaluation.load import held_out_by_protocol, load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import read_metrics
 from mien.evaluation.protocols import EvaluationSettings, evaluate_frames
-from mien.evaluation.report.text import comparison_text, protocol_lines
 from mien.evaluation.scoring import METRICS
+from mien.evaluation.text import comparison_text, protocol_lines
 from mien.evaluation.videos import choose_video_frames, match_sizes
 from mien.media.pictures import to_uint8
 from mien.media.video import probe_video, read_video_frames

@@ -7,8 +7,7 @@ from mien.batch.plan import Batch
 from mien.batch.results import DIGITS, HIGHER, paired
 from mien.disk.files import write_atomically
 from mien.machine.terminal import counted
-from mien.pages.metric_names import COLUMNS
-from mien.pages.pages import LIVING_PAGE, render
+from mien.pages.pages import COLUMNS, LIVING_PAGE, render
 
 _HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
 

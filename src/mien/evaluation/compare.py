@@ -5,16 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mien.disk.files import expect_whole
 from mien.errors import UserError
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
     FACE_SOURCE_NAMES,
     FITTED_NAME,
     OVER_DARK_NAME,
+    REMEDY,
     figure,
-    read_figures,
+    read_metrics,
 )
-from mien.pages.metric_names import COLUMNS
+from mien.pages.pages import COLUMNS
 from mien.training.run import read_run_config
 
 
@@ -106,7 +108,10 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
             warnings.append(f"{label}: was not evaluated; run `mien evaluate` on it")
             continue
         method = read_run_config(run_dir)["method"]["kind"]
-        runs.append(ScoredRun(label, run_dir, method, read_figures(run_dir)))
+        run = ScoredRun(label, run_dir, method, read_metrics(run_dir))
+        with expect_whole(run_dir / "metrics.json", REMEDY):
+            Comparison((run,), tuple(_tables([run])[0]), ()).content()  # stumbles where the name of the file is known
+        runs.append(run)
     if not runs:
         listed = ", ".join(run_dirs) or "there is none"
         raise UserError(f"no evaluated run to compare ({listed}); run `mien evaluate DIR --run NAME` first")

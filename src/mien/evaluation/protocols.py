@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.disk.config import Range
-from mien.evaluation.baselines import Baselines, make_baselines
+from mien.evaluation.baselines import Baselines, look_at_trained, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import (
     DARK,
@@ -42,7 +42,6 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
-from mien.evaluation.trained_frames import look_at_trained
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips

@@ -1,15 +1,17 @@
 """Parts of report.html, compare.html and analysis.html: explanations, tables, pictures and videos."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
+from mien.evaluation.metrics_file import figure
 from mien.media.pictures import data_uri, picture_uri, shrink
-from mien.pages.metric_names import COLUMNS
+from mien.pages.pages import COLUMNS
 
 GLOSSARY = {
     "Held-out frames": (
@@ -124,22 +126,6 @@ class Video:
     note: str
 
 
-@dataclass(frozen=True)
-class ReportVideo:
-    """A side-by-side video of a protocol."""
-
-    path: Path
-    shown: int
-    """Number of frames in the video."""
-    scored: int
-    """Number of frames that were scored."""
-
-    def on_page(self, page_folder: Path) -> Video:
-        """The video of truth, rendering and error."""
-        part = "" if self.shown == self.scored else f", {self.shown} of {self.scored} frames"
-        return video_of(self.path, page_folder, f"Truth, rendering, error{part}")
-
-
 def metric_headings(crops: int | None = None) -> list[Cell]:
     """The heading cells of all metrics, for the whole frame and then for the head crop, or for a number of crops."""
     names = [f"{name} {'↑' if higher else '↓'}" for _, name, _, higher in COLUMNS]
@@ -150,6 +136,27 @@ def metric_headings(crops: int | None = None) -> list[Cell]:
 def metric_groups() -> list[Cell]:
     """The cells above `metric_headings`."""
     return [Cell("Whole frame", "group", len(COLUMNS)), Cell("Head crop", "group head", len(COLUMNS))]
+
+
+def metric_cells(
+    entry: Mapping[str, Any],
+    parts: Sequence[str | None],
+    best: Callable[[str | None, str, bool], float | None] = lambda *_: None,
+) -> list[Cell]:
+    """The figures of a row, in the columns of `metric_headings`.
+
+    Args:
+        entry: The figures, as metrics.json has them.
+        parts: The crops, of which None is the whole frame.
+        best: Returns the best rounded figure of a column, by crop, metric and whether higher is better.
+    """
+    cells = []
+    for part in parts:
+        for index, (metric, _, digits, higher) in enumerate(COLUMNS):
+            value = figure(entry, part, metric)
+            wins = value is not None and round(value, digits) == best(part, metric, higher)
+            cells.append(Cell(figure_text(value, digits), "head" if part and index == 0 else "", best=wins))
+    return cells
 
 
 def figure_text(value: float | int | None, digits: int) -> str:
