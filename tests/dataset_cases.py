@@ -26,7 +26,7 @@ from mien.capture import read_capture
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
-from mien.datasets import matting, overlay, sequences
+from mien.datasets import overlay, pictures, sequences
 from mien.datasets.dataset import Footage
 from mien.datasets.registry import datasets
 from mien.datasets.writing import write_sequence
@@ -92,7 +92,7 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
 def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setattr(sequences, "detected_landmarks", unfound)
-    monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
+    monkeypatch.setattr(pictures, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
     monkeypatch.setattr(import_footage, "capture_video", _film_is_read)
     monkeypatch.setattr(import_footage, "capture_cameras", _rig_is_read)
     layouts.draw_at(SIDE / writers.SIDE, monkeypatch)

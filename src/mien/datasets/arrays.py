@@ -9,9 +9,7 @@ from mien.datasets.content import REMEDY
 from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import read_bytes
 from mien.errors import UserError
-from mien.face.models.npz import parse_npy, read_npz
-
-_MAX_NPY_BYTES = 16 << 20
+from mien.face.models.npz import parse_npy, read_npz, readable
 
 
 def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
@@ -23,13 +21,8 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
             a length.
         sizes: Lengths that are known, by letter.
     """
-    try:
+    with readable(path, ".npz", REMEDY):
         arrays = read_npz(path, tuple(axes))[1]
-    except FileNotFoundError:
-        raise UserError(f"{path}: is missing; {REMEDY}") from None
-    except Exception as error:  # a damaged archive may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as .npz ({reason}); {REMEDY}") from None
     known = {**{str(digit): digit for digit in range(10)}, **sizes}
     for name, letters in axes.items():
         if name not in arrays:
@@ -45,20 +38,14 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
 
 def read_npy(path: Path) -> np.ndarray:
     """Return the array of an .npy file of plain numbers."""
-    try:
-        return parse_npy(read_bytes(path, _MAX_NPY_BYTES))
-    except Exception as error:  # a damaged header may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as .npy ({reason}); {REMEDY}") from None
+    with readable(path, ".npy", REMEDY):
+        return parse_npy(read_bytes(path, 16 << 20))
 
 
 def read_some_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Return those of the named arrays of an .npz that it has, as float64, after a check of their numbers."""
-    try:
+    with readable(path, ".npz", REMEDY):
         arrays = read_npz(path, names)[1]
-    except Exception as error:  # a damaged archive may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as .npz ({reason}); {REMEDY}") from None
     for name, array in arrays.items():
         if array.size and not np.abs(array.astype(np.float64)).max() <= MAX_NUMBER:
             raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {REMEDY}")
