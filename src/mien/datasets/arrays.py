@@ -15,11 +15,8 @@ from mien.face.models.npz import parse_npy, read_npz, readable
 def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
     """Return arrays of an .npz by name. Floating point numbers become float32, and other types stay.
 
-    Args:
-        path: The file.
-        axes: A letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
-            a length.
-        sizes: Lengths that are known, by letter.
+    `axes` has a letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
+    a length. `sizes` are lengths that are known, by letter.
     """
     with readable(path, ".npz", REMEDY):
         arrays = read_npz(path, tuple(axes))[1]

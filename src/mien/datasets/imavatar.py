@@ -22,14 +22,11 @@ if TYPE_CHECKING:
 _FILE = "flame_params.json"
 _VERSION = "FLAME 2020 (generic_model.pkl)"
 _FPS = 25.0
-_SCALE = 4.0
-"""Size of the data set's world in metres' units: a head is four times as large."""
-_OLD_SIZE = 512
-"""Width of the pictures of the old format, whose intrinsics are in pixels."""
+_SCALE = 4.0  # size of the data set's world in metres' units: a head is four times as large
+_OLD_SIZE = 512  # width of the pictures of the old format, whose intrinsics are in pixels
 _TEST = ("MVI_1812", "MVI_1802", "test", "wlz0318_test")
 """Clips that the authors hold out as a whole. The other clips of the same subject are trained on."""
-_TAIL = 350
-"""Number of frames at the end that SplattingAvatar holds out of its one clip."""
+_TAIL = 350  # number of frames at the end that SplattingAvatar holds out of its one clip
 _ENDINGS = (".png", ".jpg", "")
 _CLOTHES = (15, 16)
 """Classes of `semantic` that MonoGaussianAvatar leaves out of its second set of figures: necklace and cloth."""

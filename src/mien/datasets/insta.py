@@ -43,8 +43,7 @@ TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
 """Number of frames at the end that the authors hold out."""
 _TEST = "transforms_test.json"
 _LARGER = "images.HQ"
-_FOLDERS = ("images", _LARGER, "matted", "input")
-"""Folders with pictures, of which the first one is used."""
+_FOLDERS = ("images", _LARGER, "matted", "input")  # folders with pictures, of which the first one is used
 _MASKS = "image_mask"
 
 

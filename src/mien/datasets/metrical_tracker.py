@@ -23,18 +23,15 @@ from mien.face.params import FaceParams
 from mien.machine.progress import progress_bar
 
 VERSION = "FLAME 2020 (generic_model.pkl)"
-_MAX_FRAME_BYTES = 8 << 20
-"""Largest unpacked pickle in bytes. They have about 60 kB."""
+_MAX_FRAME_BYTES = 8 << 20  # largest unpacked pickle in bytes. They have about 60 kB
 _SHAPES = {
     "flame.exp": (1, 100), "flame.shape": (1, 300), "flame.jaw": (1, 6), "flame.eyes": (1, 12), "opencv.R": (1, 3, 3),
     "opencv.t": (1, 3), "opencv.K": (1, 3, 3),
 }  # fmt: skip
 _EYELIDS = "flame.eyelids"
 _SIZE = "img_size"
-_CLOSED = 0.3
-"""Number of an eyelid above which a blink counts."""
-_MAX_CHANGE = 0.005
-"""Largest relative change of a focal length in a sequence. The tracker keeps it constant."""
+_CLOSED = 0.3  # number of an eyelid above which a blink counts
+_MAX_CHANGE = 0.005  # largest relative change of a focal length in a sequence. The tracker keeps it constant
 
 
 @dataclass(frozen=True, eq=False)

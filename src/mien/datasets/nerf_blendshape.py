@@ -29,12 +29,10 @@ if TYPE_CHECKING:
 
 _FILE = "transforms.json"
 _FPS = 25.0
-_TAIL = 500
-"""Number of frames at the end that the authors hold out."""
+_TAIL = 500  # number of frames at the end that the authors hold out
 _COEFFICIENTS = 46
 _LANDMARKS = 478
-_HEAD = (0, 0, 255)
-"""Colour of the head in the parsing, as red, green and blue."""
+_HEAD = (0, 0, 255)  # colour of the head in the parsing, as red, green and blue
 
 
 def _recognises(path: Path) -> str | None:

@@ -27,8 +27,7 @@ TRACKING = "flame2023_tracking_v2.npz"
 TEST_ENDING = "-test"
 """End of the names of sequences that `mien export` writes of held-out frames. The benchmark itself has none."""
 FPS_MONO, FPS_VIEWS = 24.3, 73.0
-_MAX_ANGLE = 1e-4
-"""Largest difference of the two forms of a rotation."""
+_MAX_ANGLE = 1e-4  # largest difference of the two forms of a rotation
 
 
 def _sequences(path: Path) -> list[Path]:

@@ -26,14 +26,12 @@ _MAX_DISTANCE = 0.15
 """Largest median distance of landmarks from those that the detector finds, over the distance of the outer corners of
 the eyes. A fitted FLAME has about 0.03 to 0.05; drawings have 0.09, because the detector is less exact in them. Another
 basis of identities or expressions changes that by 0.01 at most: only misread cameras and poses have more."""
-_CORNERS = (33, 263)
-"""MediaPipe's points at the outer corners of the eyes."""
+_CORNERS = (33, 263)  # MediaPipe's points at the outer corners of the eyes
 _MAX_SPREAD = 1.12
 """Largest spread of the skin's colours, over that without identity or without expressions. Chosen on 200
 drawn right trackings, with hard light, noise, jpg and poses that are off by 3 pixels: they had at most 1.10. Of 70
 others, none had more than 1.03."""
-_OTHER_SIZE = 1.3
-"""Least ratio of the sizes of pictures and of the camera that is told."""
+_OTHER_SIZE = 1.3  # least ratio of the sizes of pictures and of the camera that is told
 
 
 @dataclass(frozen=True)

@@ -56,12 +56,9 @@ def read_one_camera(
 ) -> tuple[UInt8[np.ndarray, "t 1 h w 3"], UInt8[np.ndarray, "t 1 h w"]]:
     """Read the pictures of one camera, and their mattes.
 
-    Args:
-        places: The pictures, in the order of time. All have the size of the first.
-        name: Name of the sequence, for the progress bar.
-        matte_of: Returns the matte of a timestep, by the opacity in its picture, if any, and the size. None if there
-            are no mattes, so that mien makes them.
-        plate: A picture of the empty scene, which makes them more exact.
+    `places` are in the order of time, and all have the size of the first. `matte_of` returns the matte of a timestep,
+    by the opacity in its picture, if any, and the size. If it is None, mien makes the mattes, more exactly with
+    `plate`, a picture of the empty scene.
     """
     size = picture_size(places[0])
 

@@ -18,24 +18,18 @@ from mien.datasets.dataset import TrackedSequence
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 
-_LANDMARKS, _SKIN = "mediapipe", 468
-"""The points that are compared, and the number of those that are not on the irises."""
-_CORNERS = (33, 263)
-"""MediaPipe's points at the outer corners of the eyes."""
-_FRAMES, _CAMERAS = 24, 3
-"""Most frames and cameras that are compared."""
+_LANDMARKS, _SKIN = "mediapipe", 468  # the points that are compared, and the number of those that are not on the irises
+_CORNERS = (33, 263)  # MediaPipe's points at the outer corners of the eyes
+_FRAMES, _CAMERAS = 24, 3  # most frames and cameras that are compared
 _MIN_FRAMES = 8
 _EYES, _MIN_EYES = 100.0, 15.0
 """Distance of the outer corners of the eyes, in pixels, to which larger pictures are shrunk, and the smallest one that
 is compared."""
-_BLUR = 0.025
-"""Sigma of the blur of pictures, over that distance."""
+_BLUR = 0.025  # sigma of the blur of pictures, over that distance
 _SHIFTS = (-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03)
 """Shifts of a whole face along each axis of the picture, over that distance, that a tracking may be off in a frame."""
-_ROUNDS = 3
-"""Number of times that the median colours and the shift of each frame are found by turns."""
-_FACING = 0.3
-"""Least cosine between the normal at a point and the direction to the camera."""
+_ROUNDS = 3  # number of times that the median colours and the shift of each frame are found by turns
+_FACING = 0.3  # least cosine between the normal at a point and the direction to the camera
 _MIN_MOTIONS = (0.006, 0.014)
 """Least motion by identity and by expressions that is compared: root mean square of points, over that distance. In
 drawings, the noise of a tracking moves a face that is still by up to 0.012."""

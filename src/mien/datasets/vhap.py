@@ -26,13 +26,10 @@ if TYPE_CHECKING:
 _VERSION = "FLAME 2023 (flame2023.pkl) with GaussianAvatars' teeth"
 _WHOLE, _TRAIN = "transforms.json", "transforms_train.json"
 _PARTS = (_WHOLE, _TRAIN, "transforms_val.json", "transforms_test.json")
-_FPS = 25.0
-"""VHAP stores no frame rate; it resamples videos to this one."""
+_FPS = 25.0  # VHAP stores no frame rate; it resamples videos to this one
 _PARAMETERS = ("translation", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "expr")
-_SHARED = ("shape", "static_offset")
-"""Arrays that are the same in all files of a sequence."""
-_SAME_PLACE = 1e-4
-"""Largest difference of a camera's matrix within a sequence."""
+_SHARED = ("shape", "static_offset")  # arrays that are the same in all files of a sequence
+_SAME_PLACE = 1e-4  # largest difference of a camera's matrix within a sequence
 
 
 @dataclass(frozen=True)

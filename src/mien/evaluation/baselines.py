@@ -83,11 +83,8 @@ def look_at_trained(
 ) -> TrainedFrames:
     """Look at the training frames of an experiment. Each picture is read once.
 
-    Args:
-        experiment: The experiment.
-        scored: Largest number of frames, evenly spread, on which the avatar is scored. 0 means none.
-        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no figure.
-        mean: Whether to compute the mean target, for which all frames are read.
+    The avatar is scored on at most `scored` evenly spread frames, and all are read for the `mean` target. `threads`
+    change no figure.
     """
     every = experiment.training_frames
     judged = spread_frames(every, scored) if scored else []

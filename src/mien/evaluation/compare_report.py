@@ -37,8 +37,7 @@ from mien.training.footage.frames import Frame
 _FRAMES = 5
 _PICTURE_SIZE = 320
 _MAX_RUNS = 8
-_STYLES = ("main", "second", "third", "fourth")
-"""Styles of the curves of the first runs. Those of more runs are quiet."""
+_STYLES = ("main", "second", "third", "fourth")  # styles of the curves of the first runs. Those of more runs are quiet
 
 
 def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[Path, Sequence[Path]]) -> None:

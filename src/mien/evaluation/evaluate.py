@@ -30,8 +30,7 @@ from mien.training.footage.filmed import read_coverage
 from mien.training.frame_gains import GAINS
 from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
-_RECIPE = 4
-"""Version of the scoring. It is raised whenever the same frame would get other figures."""
+_RECIPE = 4  # version of the scoring. It is raised whenever the same frame would get other figures
 
 
 def evaluate(

@@ -145,10 +145,8 @@ def metric_cells(
 ) -> list[Cell]:
     """The figures of a row, in the columns of `metric_headings`.
 
-    Args:
-        entry: The figures, as metrics.json has them.
-        parts: The crops, of which None is the whole frame.
-        best: Returns the best rounded figure of a column, by crop, metric and whether higher is better.
+    Of `parts`, None is the whole frame. `best` returns the best rounded figure of a column, by crop, metric and whether
+    higher is better.
     """
     cells = []
     for part in parts:

@@ -127,11 +127,7 @@ def evaluate_frames(
 ) -> Evaluation:
     """Score every held-out frame. Rendering runs here, frame by frame; scoring runs in threads.
 
-    Args:
-        experiment: The experiment to score.
-        settings: What to compute.
-        partial: Figures that an interrupted evaluation has computed. New ones are added.
-        title: Title of the progress bar.
+    `partial` has the figures that an interrupted evaluation has computed, and takes new ones.
     """
     assert experiment.held_out_frames, "nothing is held out"
     frames = experiment.held_out_frames

@@ -63,14 +63,8 @@ def write_report(
 ) -> None:
     """Write the page of a run.
 
-    Args:
-        path: The .html file.
-        run: The run's own record.
-        protocols: `protocols` of metrics.json.
-        results: The experiment and every frame's figures, by protocol.
-        videos: Side-by-side videos by protocol.
-        driven: The section on cross-reenactment (`report_sections.cross_section`).
-        alive: The avatar whose film lies beside the page.
+    `protocols` is that of metrics.json, and `driven` the section on cross-reenactment
+    (`report_sections.cross_section`). The film of `alive` lies beside the page.
     """
     first = next(iter(results.values()), None)
     hero = sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None

@@ -26,10 +26,7 @@ _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
 def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
     """Check that a face model's arrays fit each other, its indices are in range and its numbers are moderate.
 
-    Args:
-        model: face model; its landmarks are not checked.
-        where: where it was read from, for messages.
-        remedy: what the user can do about an error.
+    Its landmarks are not checked. `where` and `remedy` are for messages.
     """
     for fault in _faults(model):
         raise UserError(f"{where}: {fault}; {remedy}")
@@ -38,11 +35,7 @@ def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
 def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: str) -> None:
     """Check that face parameters belong to a face model, and are finite and moderate.
 
-    Args:
-        model: the face model.
-        face: face parameters at any number of timesteps.
-        where: where they were read from, for messages.
-        remedy: what the user can do about an error.
+    `where` and `remedy` are for messages.
     """
     b, v = len(face), len(model.template)
     shapes = {

@@ -39,8 +39,7 @@ TENSORS = (
     "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
     "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
 )  # fmt: skip
-_BASE = "anny"
-"""The face model whose mesh, joints and landmarks `coefficients-N` has."""
+_BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
 _NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
 LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from mien.face.model import FaceModel
 
 
-_MAX_SHAPES = 256
-"""Largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h."""
+_MAX_SHAPES = 256  # largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h
 
 
 def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:

@@ -95,14 +95,7 @@ class Filmed:
 
 
 def filmed_frames(sequence: Sequence, face_model: FaceModel, settings: TrainSettings, mattes: MatteKind) -> Filmed:
-    """Return the frames of a sequence that mien trains on, and those that it holds out. Others are left out.
-
-    Args:
-        sequence: The sequence.
-        face_model: The face model of its tracking.
-        settings: What is held out.
-        mattes: Mattes that are written.
-    """
+    """Return the frames of a sequence that mien trains on, and those that it holds out. Others are left out."""
     trained = {frame.timestep for frame in training_frames([sequence], settings)}
     left_out = held_out_of(sequence, settings.split).numpy()
     usable = sequence.usable().any(1)

@@ -26,8 +26,7 @@ from mien.media.picture_files import write_png
 from mien.render.mesh import rasterize_mesh
 
 _EXPRESSIONS, _SHAPES = 100, 300
-_VALIDATED = 20
-"""Number of pictures of the test at its end that val holds as well."""
+_VALIDATED = 20  # number of pictures of the test at its end that val holds as well
 _OPEN_RADIANS, _OPEN_SHARE = 0.2, 0.5
 """The mouth of canonical.obj: the angle of a jaw, or the coefficient of an expression that opens it."""
 _MILLIMETRES = 1000

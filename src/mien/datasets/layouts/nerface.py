@@ -12,11 +12,9 @@ from mien.datasets.layouts.writing import write_plain_json
 from mien.machine.progress import track_progress
 from mien.media.picture_files import write_png
 
-_MEAN_DISTANCE = 0.5
-"""Mean distance of the camera from the head in its world; near and far planes are at 0.2 and 0.8."""
+_MEAN_DISTANCE = 0.5  # mean distance of the camera from the head in its world; near and far planes are at 0.2 and 0.8
 _NUMBERS = 76
-_VALIDATED = 5
-"""Number of training pictures that val holds once more."""
+_VALIDATED = 5  # number of training pictures that val holds once more
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 

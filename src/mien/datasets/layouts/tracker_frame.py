@@ -20,12 +20,8 @@ def write_tracker_frame(
 ) -> None:
     """Write a checkpoint. FLAME's root and neck are at rest in it, and the camera moves.
 
-    Args:
-        path: The file.
-        flame: `shape` [300], `expr` [100], `jaw_pose` [3], and `eyes_pose` [6] (left, then right), axis-angles.
-        view: World-to-camera rotation and translation with OpenCV's axes, in metres, and intrinsics in pixels.
-        size: Width and height of the picture.
-        number: Number of the frame.
+    `flame` holds `shape` [300], `expr` [100], `jaw_pose` [3], and `eyes_pose` [6] (left, then right), axis-angles.
+    `view` is the world-to-camera rotation and translation with OpenCV's axes, in metres, and intrinsics in pixels.
     """
     rotation, translation, K = view
     eyes = np.concatenate([_six(part) for part in np.split(flame["eyes_pose"], 2)], axis=1)

@@ -37,21 +37,16 @@ from mien.face.models.schema import (
 REGIONS = ("skin", "neck", "eyes", "irises")
 """Regions that follow from skinning weights. `mien.tracking.landmarks` finds more, by landmarks."""
 
-_CHAIN = (-1, 0, 1, 1, 1)
-"""Parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck."""
-_TURNED = (1, 2, 3, 4)
-"""FLAME's joints about which mien's neck, jaw and eyes turn."""
-_SPLITS = {400: 300}
-"""Number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023."""
+_CHAIN = (-1, 0, 1, 1, 1)  # parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck
+_TURNED = (1, 2, 3, 4)  # FLAME's joints about which mien's neck, jaw and eyes turn
+_SPLITS = {400: 300}  # number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023
 _SHAPES = {
     "v_template": "v 3", "f": "f 3", "shapedirs": "v 3 n", "posedirs": "v 3 36", "J_regressor": "5 v", "weights": "v 5",
 }  # fmt: skip
 
 _KEYS = frozenset({*_SHAPES, "kintree_table", "identities", "vt", "ft"})
-_OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})
-"""Keys by which FLAME's other files are recognised."""
-_MAX_NAME_LENGTH, _MAX_NAMES = 40, 20
-"""Most characters of a name, and most names, that a message shows."""
+_OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})  # keys by which FLAME's other files are recognised
+_MAX_NAME_LENGTH, _MAX_NAMES = 40, 20  # most characters of a name, and most names, that a message shows
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,20 +30,16 @@ PACKED_KEYS = ("v", "f_quad", "identity", "expression", "expression_names")
 NEUTRAL = "generic_neutral_mesh.obj"
 """File of the folder FaceXModel that holds the mean head."""
 
-_METERS = 0.01
-"""Metres in the model's unit."""
+_METERS = 0.01  # metres in the model's unit
 _MOUTH, _SOCKETS, _GUMS, _TEETH = (11248, 13294), (13294, 14062), (14062, 17039), (17039, 21451)
 _EYEBALLS = {"left_eye": (21451, 22221), "right_eye": (23021, 23791)}
 """Ranges of vertices, as the model's documentation lists them. Of each eyeball, the outer layer."""
 _KEPT = ((0, 21451), *_EYEBALLS.values())
-_UNSEEN = ("PupilDilate_L", "PupilDilate_R")
-"""Expressions of the inner layer of the eyeballs, which is left out."""
-_WHOLE = ("browInnerUp", "cheekPuff")
-"""Expressions of ARKit that the model has as two halves, which add up to them."""
+_UNSEEN = ("PupilDilate_L", "PupilDilate_R")  # expressions of the inner layer of the eyeballs, which is left out
+_WHOLE = ("browInnerUp", "cheekPuff")  # expressions of ARKit that the model has as two halves, which add up to them
 _NECK_PLANES = (-0.1185, -0.1688)
 """Values of y + 0.5 z, in metres in the head frame, at which the neck's weight is 0 and 1: the default model's."""
-_NECK_PIVOT = (-0.1359, -0.0136)
-"""Height and depth of the neck joint in the head frame, in metres: the default model's."""
+_NECK_PIVOT = (-0.1359, -0.0136)  # height and depth of the neck joint in the head frame, in metres: the default model's
 _LOWER_MOTION = 1.0
 """Motion in the model's unit, for a jaw that is wide open, from which teeth and tongue belong to the jaw."""
 _MAX_IDENTITIES = 200

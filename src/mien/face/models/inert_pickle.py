@@ -23,8 +23,7 @@ _MAX_FILE_BYTES = MAX_MODEL_BYTES + (16 << 20)
 _MAX_READS = 400_000
 """Most reads of a pickle, at least one for each opcode. FLAME's files have some hundreds; each costs up to about a
 hundred bytes of memory."""
-_NUMBERS = re.compile(r"[biuf][1248]")
-"""Numpy's type codes for arrays of plain numbers."""
+_NUMBERS = re.compile(r"[biuf][1248]")  # numpy's type codes for arrays of plain numbers
 
 
 class _StandIn:

@@ -21,8 +21,7 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _ENDING = ".npy"
-_NUMBERS = "biuf"
-"""Kinds of plain numbers, by numpy's letters."""
+_NUMBERS = "biuf"  # kinds of plain numbers, by numpy's letters
 
 
 @contextmanager

@@ -12,10 +12,8 @@ from mien.face.model import JOINTS
 
 LARGEST_COEFFICIENT = 3.0  # bound of an expression coefficient in standard deviations, as FLAME and GNM have them
 IRIS_RADIUS = 0.0061  # radius of the iris in metres. Anatomy: it hardly differs between people
-_MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6
-"""Range of the height of a head with its neck, in metres."""
-_MAX_NUMBER = 1e6
-"""Bound of all numbers in a file: metres, weights and indices."""
+_MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6  # range of the height of a head with its neck, in metres
+_MAX_NUMBER = 1e6  # bound of all numbers in a file: metres, weights and indices
 
 
 def check_arrays(
@@ -23,12 +21,8 @@ def check_arrays(
 ) -> dict[str, int]:
     """Check shapes and numbers of arrays, and return the sizes that the letters stand for.
 
-    Args:
-        path: The file, for messages.
-        arrays: Its arrays.
-        shapes: The shape of each, such as "v 3". A letter is the same size wherever it stands.
-        missing: What to say of one that is missing.
-        remedy: What to do about a wrong one.
+    `shapes` are such as "v 3": a letter is the same size wherever it stands. `missing` is said of an array that is
+    missing.
     """
     sizes: dict[str, int] = {}
     for key in shapes:
