@@ -24,7 +24,7 @@ from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.datasets import overlay, pictures, sequences
 from mien.datasets.layouts.filmed import Filmed, filmed_frames
-from mien.datasets.layouts.registry import find_layout
+from mien.datasets.layouts.layout import find_layout
 from mien.datasets.layouts.writing import write_layout
 from mien.datasets.pictures import read_picture
 from mien.datasets.sequences import tracked_sequence

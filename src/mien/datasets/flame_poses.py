@@ -56,12 +56,12 @@ def carried(
     return replace(face, head_rotation=axis_angle_from_matrix(turns @ pose).float(), head_translation=place.float())
 
 
-def in_front(face: FaceParams, viewmats: Float[np.ndarray, "t 4 4"]) -> FaceParams:
+def in_front(face: FaceParams, viewmats: Float[np.ndarray, "*t 4 4"]) -> FaceParams:
     """Return faces seen by a moving camera as moving faces seen by the camera `FRONT`.
 
-    `viewmats` are the world-to-camera matrices of the moving camera, with OpenCV's axes.
+    `viewmats` are world-to-camera matrices with OpenCV's axes: one for each timestep, or one of a camera that stands.
     """
-    return carried(face, AXES @ viewmats[:, :3, :3], viewmats[:, :3, 3] @ AXES)
+    return carried(face, AXES @ viewmats[..., :3, :3], viewmats[..., :3, 3] @ AXES)
 
 
 def camera_of(K: Float[np.ndarray, "3 3"], viewmat: Float[np.ndarray, "4 4"], size: tuple[int, int]) -> Camera:

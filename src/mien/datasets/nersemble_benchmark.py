@@ -171,8 +171,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         known = _known_cameras(path, serials[:1], size)[serials[0]]
         viewmat = known.viewmat.double().numpy().copy()
         viewmat[:3, 3] /= scale
-        face = carried(face_of_flame(file, model, flame), turns, shifts / scale)
-        face = in_front(face, np.repeat(viewmat[None], len(face), 0))
+        face = in_front(carried(face_of_flame(file, model, flame), turns, shifts / scale), viewmat)
         camera = {serials[0]: camera_of(known.K.double().numpy(), FRONT, size)}
         pictures = images[:, :1], mattes[:, :1]
         sequence = sequence_of(file, folder.name, pictures, camera, FPS_MONO, (model, face), VERSION)

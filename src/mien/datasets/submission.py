@@ -61,8 +61,7 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
         flame, turns, shifts, scale = flame_from_benchmark(tracking)
         views = {serial: _shrunk(known[serial], scale) for serial in TEST_CAMERAS}
         ahead = views[TRAINING_CAMERA]
-        face = carried(face_of_flame(tracking, model, flame), turns, shifts / scale)
-        face = in_front(face, np.repeat(ahead[None], len(face), 0))
+        face = in_front(carried(face_of_flame(tracking, model, flame), turns, shifts / scale), ahead)
         placed = {serial: view @ np.linalg.inv(ahead) @ FRONT for serial, view in views.items()}
         tasks.append(Task(name, face, _cameras(known, placed), FPS_MONO))
     return tasks

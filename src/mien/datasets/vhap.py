@@ -221,7 +221,7 @@ def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
         viewmats = _viewmats(group)
         if len(viewmats) == 1:
             (camera, viewmat) = next(iter(viewmats.items()))
-            face = None if face is None else in_front(face, np.repeat(viewmat[None], len(face), 0))
+            face = None if face is None else in_front(face, viewmat)
             viewmats = {camera: FRONT}
 
         def cameras(

@@ -16,7 +16,6 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import PROTOCOL_NAMES
 from mien.evaluation.page_parts import (
-    GLOSSARY,
     Card,
     Cell,
     DataTable,
@@ -52,7 +51,6 @@ def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[
             {"heading": _heading(table), "table": _data_table(table), "chart": _chart(table), "frames": shown}
             for table, shown in zip(comparison.tables, frames, strict=True)
         ],
-        glossary=GLOSSARY,
     )
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 

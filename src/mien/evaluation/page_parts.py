@@ -1,4 +1,4 @@
-"""Parts of report.html, compare.html and analysis.html: explanations, tables, pictures and videos."""
+"""Parts of report.html, compare.html and analysis.html: tables, pictures and videos."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,57 +13,6 @@ from mien.evaluation.metrics_file import figure
 from mien.media.pictures import data_uri, picture_uri, shrink
 from mien.pages.pages import COLUMNS
 
-GLOSSARY = {
-    "Held-out frames": (
-        "Frames that training never saw. blocks: every fifth block of 10 frames. tail: the last 20 %, which may show "
-        "poses and expressions that never occurred before, so its figures are lower. sequences: whole sequences, posed "
-        "as tracked. cameras: held-out cameras, at timesteps that training saw through other cameras."
-    ),
-    "Target": (
-        "The person inside a frozen mask (the matte, cut at the neck), over white. The mask does not change "
-        "when the sequence is tracked again, so that runs can be compared. Where the matte is soft, the colours are "
-        "those of the person, estimated from what is solid nearby. With `mien evaluate --edges filmed`, which tables "
-        "then name, they are the filmed ones, which hold some of the background."
-    ),
-    "Over dark blue": (
-        "The same frames and faces over a dark background, red 26, green 32, blue 80 of 255. An avatar can look right "
-        "over white because it lets white through, at light skin and thin hair, and has holes over other backgrounds. "
-        "Compare these figures only with those of other runs over dark blue: dark hair differs less from dark blue "
-        "than from white, so that they can be above or below the figures over white."
-    ),
-    "Whole frame, head crop": (
-        "A white background raises the PSNR of the whole frame by several dB, so compare clips by their head crops. "
-        "The head crop is the box of the mask."
-    ),
-    "Eyes, mouth": (
-        "Boxes around the lids and around the lips of the tracked mesh, with a margin, in frames in which it faces the "
-        "camera. ST-LPIPS enlarges them if a side is shorter than 64 pixels."
-    ),
-    "Baselines": (
-        "An avatar must beat both: the mean of all training pictures, and the tracked mesh with the colours that "
-        "training frames show on it. The green figure is the avatar's lead over the better one, in dB."
-    ),
-    "Face parameters": (
-        "as tracked: the tracker alone poses held-out frames. corrected: training also improved the tracking of the "
-        "frames that it saw, and held-out frames get these corrections, interpolated over time. The pixels of held-out "
-        "frames are never used."
-    ),
-    "PSNR, SSIM, L1": (
-        "Images are in 0..1 and clamped. Figures are means over frames. SSIM uses an 11x11 Gaussian window of sigma "
-        "1.5, with zeros beyond the border."
-    ),
-    "ST-LPIPS": (
-        "A learned distance that tolerates shifts of a few pixels. Its figures cannot be compared with those of LPIPS."
-    ),
-}
-"""Explanation of each term, for readers who see it for the first time."""
-FITTED_GLOSSARY = {
-    "Faces fitted to the scored pictures": (
-        "Expression and pose of each held-out frame, tuned by the difference of colours to the very picture that is "
-        "scored. The figures show what the avatar can draw, not what it predicts, so compare them only with each other."
-    ),
-}
-"""Explanation for pages that show such figures."""
 _MAX_EMBEDDED_BYTES = 6 << 20
 
 

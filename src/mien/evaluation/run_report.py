@@ -16,8 +16,6 @@ from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, Living
 from mien.evaluation.metrics_file import BASELINE_NAMES, FITTED_NAME, OVER_DARK_NAME, PART_NAMES, PROTOCOL_NAMES, figure
 from mien.evaluation.page_parts import (
-    FITTED_GLOSSARY,
-    GLOSSARY,
     Cell,
     DataTable,
     Video,
@@ -96,6 +94,7 @@ def report_html(
         }
         for name, (experiment, evaluation) in results.items()
     ]
+    backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
     return render(
         "evaluation/templates/report.html",
         title=f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}",
@@ -106,7 +105,8 @@ def report_html(
         page=page,
         tiles=_tiles(run, protocols),
         tables=_tables(protocols),
-        glossary=_glossary(protocols),
+        fitted=any("fitted" in entry for entry in protocols.values()),
+        backbones=", ".join(sorted(backbones)) or "not computed",
         protocols=shown,
         driven=driven,
         training=sections.training_curves(run.curves),
@@ -179,16 +179,6 @@ def _cells(key: str, subjects: Mapping[str, Any]) -> list[Cell]:
         if value is not None and known:
             cells[place] = replace(cells[place], lead=f"{value - max(known):+.1f}")
     return cells
-
-
-def _glossary(protocols: Mapping[str, Any]) -> dict[str, str]:
-    backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
-    fitted = FITTED_GLOSSARY if any("fitted" in entry for entry in protocols.values()) else {}
-    return {
-        **GLOSSARY,
-        **fitted,
-        "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}.",
-    }
 
 
 def _duration(seconds: float) -> str:
