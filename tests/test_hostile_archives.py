@@ -17,8 +17,7 @@ from flame_like import flame_like, write_npz
 from fuzzing.dataset_faults import RunsCode
 from fuzzing.formats import npy_of, zip_of
 from fuzzing.kinds import SMALL_PICKLES
-from mien.datasets.arrays import read_npy, read_some_arrays
-from mien.datasets.content import inner, numbers, read_object
+from mien.datasets.content import inner, numbers, read_npy, read_object, read_some_arrays
 from mien.datasets.metrical_tracker import read_tracker_frames
 from mien.face import load_face_model
 from mien.face.models import inert_pickle, npz

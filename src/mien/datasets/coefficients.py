@@ -16,6 +16,7 @@ from jaxtyping import Float
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, ReadSequence, TrackedSequence
 from mien.datasets.flame_poses import AXES, FRONT, axis_angles, camera_of
+from mien.datasets.overlay import spread_out
 from mien.datasets.sequences import tracked_sequence
 from mien.errors import UserError
 from mien.face.loading import coefficient_count
@@ -66,7 +67,7 @@ def with_coefficients(
     assert capture.calibration is not None
     K = capture.calibration[0].K.double().numpy()
     usable = np.flatnonzero(capture.valid[:, 0])
-    usable = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).round().astype(int))]
+    usable = usable[spread_out(len(usable), _FRAMES)]
     points = face_model.landmark_positions(face_model.head_vertices(face_model.neutral()), _MARKS)[0]
     marks, seen = points[:_FACE_MARKS].double().numpy(), capture.landmarks[usable, 0, :_FACE_MARKS].astype(np.float64)
     if place is None:

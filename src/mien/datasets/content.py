@@ -1,9 +1,9 @@
-"""Files of strangers inside a dataset: paths that stay in it, json with checked numbers, pictures of checked sizes.
+"""Files of strangers inside a dataset: paths that stay in it, json and arrays with checked numbers and shapes.
 
-This file needs no torch, because datasets are surveyed before any work.
+Nothing in them is run, and their size is limited. This file needs no torch: datasets are surveyed before any work.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from mien.disk.inside import is_one_line
 from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import UserError
-from mien.face.models.npz import readable
+from mien.face.models.npz import parse_npy, read_npz, readable
 
 REMEDY = "copy the files of the dataset again"
 
@@ -151,3 +151,40 @@ def _is_numeric(content: Any) -> bool:
     if isinstance(content, list):
         return all(map(_is_numeric, content))
     return isinstance(content, (int, float)) and not isinstance(content, bool)
+
+
+def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Return arrays of an .npz by name. Floating point numbers become float32, and other types stay.
+
+    `axes` has a letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
+    a length. `sizes` are lengths that are known, by letter.
+    """
+    with readable(path, ".npz", REMEDY):
+        arrays = read_npz(path, tuple(axes))[1]
+    known = {**{str(digit): digit for digit in range(10)}, **sizes}
+    for name, letters in axes.items():
+        if name not in arrays:
+            raise UserError(f"{path}: has no {name!r}; {REMEDY}")
+        shape = arrays[name].shape
+        expected = [known.setdefault(letter, size) for letter, size in zip(letters, shape, strict=False)]
+        if len(letters) != len(shape) or list(shape) != expected or 0 in shape:
+            raise UserError(
+                f"{path}: {name!r} has the shape {list(shape)}, which is not [{', '.join(letters)}]; {REMEDY}"
+            )
+    return {name: each.astype(np.float32) if each.dtype.kind == "f" else each for name, each in arrays.items()}
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Return the array of an .npy file of plain numbers."""
+    with readable(path, ".npy", REMEDY):
+        return parse_npy(read_bytes(path, 16 << 20))
+
+
+def read_some_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Return those of the named arrays of an .npz that it has, as float64, after a check of their numbers."""
+    with readable(path, ".npz", REMEDY):
+        arrays = read_npz(path, names)[1]
+    for name, array in arrays.items():
+        if array.size and not np.abs(array.astype(np.float64)).max() <= MAX_NUMBER:
+            raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {REMEDY}")
+    return {name: array.astype(np.float64) for name, array in arrays.items()}

@@ -58,7 +58,7 @@ def _in_time(path: Path, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     A row of it has the number of a picture of the whole clip, and its number among the training pictures or -1.
     """
-    from mien.datasets.arrays import read_npy
+    from mien.datasets.content import read_npy
 
     file = path / "index_map.npy"
     if not file.exists():

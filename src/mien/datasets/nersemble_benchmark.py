@@ -73,7 +73,7 @@ def flame_from_benchmark(file: Path) -> "tuple[dict[str, np.ndarray], np.ndarray
 
     Rotations are those of `rotation_matrices`. The Euler angles of `rotation` must say the same.
     """
-    from mien.datasets.arrays import read_arrays
+    from mien.datasets.content import read_arrays
 
     axes = {
         "shape": "1s", "expression": "te", "rotation": "t3", "rotation_matrices": "t33", "translation": "t3",

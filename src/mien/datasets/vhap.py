@@ -148,7 +148,7 @@ def _viewmats(group: _Group) -> dict[str, np.ndarray]:
 
 def _flame_arrays(group: _Group, root: Path) -> dict[str, np.ndarray]:
     """The arrays of all timesteps, as in flame_param.npz of GaussianAvatars."""
-    from mien.datasets.arrays import read_some_arrays
+    from mien.datasets.content import read_some_arrays
 
     rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_PARAMETERS, "dynamic_offset")}
     shared: dict[str, np.ndarray] = {}

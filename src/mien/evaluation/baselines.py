@@ -57,31 +57,21 @@ class Baselines:
         return image.clamp(0, 1)
 
 
-@dataclass(frozen=True, eq=False)
-class TrainedFrames:
-    """The means of the training frames, and the avatar's scores on some of them."""
-
-    means: dict[Frame, Float[Tensor, "h w 3"]]
-    """The mean target of each sequence and camera. The keys have timestep 0. Empty if it was not asked for."""
-    psnr: dict[Frame, tuple[float, float]]
-    """PSNR of the avatar on the whole frame and on the head crop of some frames."""
-
-
 @torch.no_grad()
 def make_baselines(
-    experiment: Experiment, threads: int | None = None, trained: TrainedFrames | None = None
+    experiment: Experiment, threads: int | None = None, means: dict[Frame, Tensor] | None = None
 ) -> Baselines:
-    """Both baselines, from training frames only. `trained` are the means, if they are known."""
+    """Both baselines, from training frames only. `means` are those of `look_at_trained`, if they are known."""
     model, frames = experiment.avatar.face_model, experiment.training_frames
     colors = vertex_colors(model, experiment.sequences, experiment.faces, frames, threads)
-    return Baselines((trained or look_at_trained(experiment, 0, threads)).means, colors)
+    return Baselines(look_at_trained(experiment, 0, threads)[0] if means is None else means, colors)
 
 
 @torch.no_grad()
 def look_at_trained(
     experiment: Experiment, scored: int, threads: int | None = None, *, mean: bool = True
-) -> TrainedFrames:
-    """Look at the training frames of an experiment. Each picture is read once.
+) -> tuple[dict[Frame, Float[Tensor, "h w 3"]], dict[Frame, tuple[float, float]]]:
+    """The mean target of each sequence and camera (at timestep 0), and PSNR on frame and head crop of some frames.
 
     The avatar is scored on at most `scored` evenly spread frames, and all are read for the `mean` target. `threads`
     change no figure.
@@ -114,4 +104,4 @@ def look_at_trained(
             key = frame._replace(timestep=0)
             sums[key] = sums[key].add_(target) if key in sums else target
             counts[key] = counts.get(key, 0) + 1
-    return TrainedFrames({key: total / counts[key] for key, total in sums.items()}, figures)
+    return {key: total / counts[key] for key, total in sums.items()}, figures

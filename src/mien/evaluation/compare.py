@@ -87,9 +87,7 @@ class Comparison:
             "version": 1,
             "tables": [
                 {
-                    "protocol": table.protocol,
-                    "split": table.split,
-                    "frames": table.frames,
+                    **{name: getattr(table, name) for name in ("protocol", "split", "frames")},
                     "scored_on": dict(table.scored_on),
                     "edges": table.edges,
                     "rows": [_row_content(row) for row in table.rows],
@@ -184,27 +182,19 @@ def _differences(table: Table) -> list[str]:
 
 
 def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
-    rows: list[Row] = []
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
-        rows.append(Row(run.label, entry, run, FACE_SOURCE_NAMES[entry["face_params"]]))
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
-        if entry["face_params"] != "as_tracked":
-            rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
-        if "fitted" in entry:
-            rows.append(Row(run.label, entry["fitted"], None, FITTED_NAME))
-    first = runs[0].metrics["protocols"][protocol]
+    entries = [(run, run.metrics["protocols"][protocol]) for run in runs]
+    first, names = entries[0][1], FACE_SOURCE_NAMES
+    rows = [Row(run.label, entry, run, names[entry["face_params"]]) for run, entry in entries]
+    corrected = [(run, entry) for run, entry in entries if entry["face_params"] != "as_tracked"]
+    rows += [Row(run.label, entry["as_tracked"], None, names["as_tracked"]) for run, entry in corrected]
+    rows += [Row(run.label, entry["fitted"], None, FITTED_NAME) for run, entry in entries if "fitted" in entry]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
     # Last, as they are not on the scale of the rows above.
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
+    for run, entry in entries:
         if "over_dark" in entry:
             label = f"{run.label}, {OVER_DARK_NAME}"
-            rows.append(Row(label, entry["over_dark"], None, FACE_SOURCE_NAMES[entry["face_params"]]))
+            rows.append(Row(label, entry["over_dark"], None, names[entry["face_params"]]))
     return Table(protocol, first["split"], first["frames"], first["scored_on"], first["edges"], tuple(rows))
 
 

@@ -83,11 +83,7 @@ def _evaluate(
         driven = {"cross_reenactment": entry}
     fingerprints = {name: partial.fingerprint for name, partial in partials.items()}
     content = {"protocols": {**protocols, **driven}, "training": summary, "fingerprints": fingerprints}
-    videos = {
-        name: _video(run_dir, name, experiment, evaluation, settings)
-        for name, (experiment, evaluation) in results.items()
-        if settings.video_frames
-    }
+    videos = {name: _video(run_dir, name, *results[name], settings) for name in results if settings.video_frames}
     for name, experiment in experiments.items():
         if settings.pictures:
             write_scored_pictures(run_dir / "pictures" / name, experiment)
@@ -124,9 +120,8 @@ def _video(
     run_dir: Path, name: str, experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings
 ) -> Video:
     path = run_dir / "videos" / f"{name}.mp4"
-    count = write_comparison_video(
-        path, experiment, evaluation, settings.video_frames, worker_threads(settings.threads)
-    )
+    threads = worker_threads(settings.threads)
+    count = write_comparison_video(path, experiment, evaluation, settings.video_frames, threads)
     part = "" if count == len(evaluation.frames) else f", {count} of {len(evaluation.frames)} frames"
     return video_of(path, run_dir, f"Truth, rendering, error{part}")
 

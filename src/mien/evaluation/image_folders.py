@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -125,10 +125,7 @@ class ImageFolders:
     """Colour behind pictures with an alpha channel, and behind the truth outside the mattes."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """One picture and its truth."""
-
+class _Pair(NamedTuple):
     name: str
     image: UInt8[np.ndarray, "h w 3"]
     truth: UInt8[np.ndarray, "h w 3"]
