@@ -65,15 +65,15 @@ def _survey(path: Path) -> Findings:
     return Findings((Clip(path.name, len(frames)),), None, split, tuple(missing))
 
 
-def _read_landmarks(path: Path) -> np.ndarray:
+def _read_landmarks(root: Path, path: Path) -> np.ndarray:
     """The 478 points of a .lms file in pixels; NaN if the file is missing."""
     from mien.disk.reading import read_bytes
 
+    if not is_file_inside(root, path):
+        return np.full((_LANDMARKS, 2), np.nan)
     try:
         text = read_bytes(path, 1 << 20).decode("ascii")
         points = np.array(text.split(), np.float64).reshape(-1, 2)
-    except FileNotFoundError:
-        return np.full((_LANDMARKS, 2), np.nan)
     except (OSError, ValueError):
         points = np.zeros((0, 2))
     if points.shape != (_LANDMARKS, 2) or not np.abs(points).max() < 1e6:
@@ -98,9 +98,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         return (classes == _HEAD).all(-1).astype(np.uint8) * 255
 
     images, mattes = read_one_camera(places, path.name, matte if (path / "parsing").is_dir() else None)
-    marks = [place.with_suffix(".lms") for place in places]
-    landmarks = np.stack([_read_landmarks(mark) if is_file_inside(path, mark) else _read_landmarks(path / "none.lms")
-                          for mark in marks])[:, None]  # fmt: skip
+    landmarks = np.stack([_read_landmarks(path, place.with_suffix(".lms")) for place in places])[:, None]
     given = landmarks.astype(np.float32) if np.isfinite(landmarks).any() else None
     fx, fy, cx, cy = scalars(file, content, "fx", "fy", "cx", "cy")
     # Rays go through whole pixels there, which are the corners of pixels here.

