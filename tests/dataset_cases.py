@@ -26,7 +26,7 @@ from mien.capture import read_capture
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
-from mien.datasets import matting, overlay, sequences
+from mien.datasets import overlay, pictures, sequences
 from mien.datasets.dataset import Footage
 from mien.datasets.registry import datasets
 from mien.datasets.writing import write_sequence
@@ -34,9 +34,8 @@ from mien.disk.limits import camera_fault
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.face.loading import add_face_model
+from mien.face.loading import add_face_model, coefficient_head
 from mien.face.model import Landmarks
-from mien.face.models.coefficients import coefficient_head
 from mien.face.models.flame import flame_face_model, read_flame
 from mien.media.video import read_video_frames, write_video
 from mien.pipeline import import_dataset as import_footage
@@ -93,7 +92,7 @@ LAYOUTS: dict[str, Callable[[Path, Scene], Path]] = {
 def make_quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setattr(sequences, "detected_landmarks", unfound)
-    monkeypatch.setattr(matting, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
+    monkeypatch.setattr(pictures, "fill_mattes", lambda images, mattes, plate=None: mattes.fill(255))
     monkeypatch.setattr(import_footage, "capture_video", _film_is_read)
     monkeypatch.setattr(import_footage, "capture_cameras", _rig_is_read)
     layouts.draw_at(SIDE / writers.SIDE, monkeypatch)

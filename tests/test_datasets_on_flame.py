@@ -13,7 +13,7 @@ import dataset_layouts as layouts
 import dataset_writers as writers
 from dataset_scene import SIDE, NoDetector, Scene, draw, drawn_person, unfound
 from flame_like import write_npz
-from mien.datasets import insta, matting, overlay, sequences
+from mien.datasets import insta, overlay, pictures, sequences
 from mien.datasets.pictures import read_picture
 from mien.datasets.registry import find_dataset
 from mien.datasets.writing import write_sequence
@@ -119,7 +119,7 @@ def test_the_output_of_metrical_tracker_gets_mattes(scene: Scene, tmp_path: Path
         for timestep in range(len(images)):
             mattes[timestep, 0] = writers.seen_by_tracker(scene, timestep, writers.OFF_CENTRE)[1]
 
-    monkeypatch.setattr(matting, "fill_mattes", fill)
+    monkeypatch.setattr(pictures, "fill_mattes", fill)
     folder = layouts.write_tracker_output(tmp_path / "me", scene)
     found = checks.read(folder, "insta", scene.model)
     checks.check_import(found, layouts.TRACKED["insta"], scene)

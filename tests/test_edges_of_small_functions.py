@@ -2,7 +2,6 @@
 
 import math
 import os
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from mien.disk.limits import MAX_NUMBER
 from mien.errors import UserError
 from mien.face.checks import check_face_model
 from mien.face.mirror import triangle_geometry
-from mien.face.models.npz import read_npz
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.pipeline.expression import with_expression
 from mien.render.camera_paths import sway
@@ -79,14 +77,6 @@ def test_numbers_of_faces_and_face_models_have_limits_on_either_side() -> None:
         found = face.expression[:, 0] if name == "move0" else face.joints[:, model.free_joint_names.index("neck"), 0]
         assert found.tolist() == [value] * 2
         refuses(f"--set {name}={beyond}: {name} goes from", with_expression, rest, model, (f"{name}={beyond}",))
-
-
-def test_an_archive_may_have_a_comment(tmp_path: Path) -> None:
-    for length in (0, 300, 65535):
-        np.savez(tmp_path / "a.npz", v=np.arange(3.0))
-        with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
-            archive.comment = b"c" * length
-        assert read_npz(tmp_path / "a.npz", {"v"})[1]["v"].tolist() == [0, 1, 2]
 
 
 def test_normals_of_triangles_point_to_where_corners_run_counterclockwise() -> None:

@@ -14,8 +14,8 @@ from mien.evaluation.baselines import make_baselines
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report.report_sections import spans
-from mien.evaluation.report.writing import RunRecord, report_html
+from mien.evaluation.report_sections import spans
+from mien.evaluation.run_report import RunRecord, report_html
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
 from mien.gaussians import sh_from_rgb
 from mien.pages.plots import Axes, Series, line_chart

@@ -1,7 +1,6 @@
 """Pictures of other programs and faces fitted to held-out pictures get the figures of `mien evaluate`."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,13 +20,12 @@ from mien.evaluation.image_folders import ImageFolders, read_crops, score_folder
 from mien.evaluation.metrics import l1, psnr
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report.text import protocol_lines
 from mien.evaluation.scoring import ScoreSettings
+from mien.evaluation.text import protocol_lines
 from mien.media.video import write_video
 from mien.tracking.scoring import Scoring
 from plain_settings import plain_config, plain_run
-from refusals import complaint, refuses
-from shared_things import MadeOnce, toy_workspace
+from refusals import refuses
 
 pytestmark = pytest.mark.unchecked
 PLAIN = ScoreSettings(perceptual=False)
@@ -222,27 +220,3 @@ def test_fits_are_a_third_figure_in_any_order_and_never_the_headline(tmp_path: P
     assert entry["fitted"]["fit"]["steps"] == 20
     assert "fitted" not in protocol_lines("self_reenactment", entry)[1]
     assert evaluate_frames(experiment, FIT, partial).scores == scored.scores, "resumed"
-
-
-@pytest.mark.usefixtures("short_films")
-def test_the_command_adds_the_figure_only_if_it_is_asked_for(made_once: MadeOnce, tmp_path: Path, capsys) -> None:
-    shutil.copytree(toy_workspace(made_once), tmp_path / "W")
-    run_dir, command = tmp_path / "W/runs/toy", ["evaluate", str(tmp_path / "W"), "--no-perceptual"]
-    assert main(command) == 0
-    assert not any("fitted" in (run_dir / name).read_text() for name in ("metrics.json", "report.html"))
-    assert main([*command, "--fit-faces", "--fit-steps", "5", "--json"]) == 0
-    shown = capsys.readouterr()
-    entry = next(iter(json.loads(shown.out)["protocols"].values()))
-    assert entry["fitted"]["fit"]["steps"] == 5
-    assert "faces fitted to the scored pictures" in shown.err
-    assert "Avatar, faces fitted to the scored pictures" in (run_dir / "report.html").read_text()
-    assert main(["evaluate", str(tmp_path / "W"), "--compare"]) == 0
-    table = capsys.readouterr().out
-    assert [line for line in table.splitlines() if line.startswith("toy") and "fitted to the scored pictures" in line]
-    assert main(command) == 0
-    assert "fitted" not in (run_dir / "metrics.json").read_text()
-    for more, told in (
-        (["--fit-faces", "--fit-steps", "0"], "--fit-steps 0: give a number from 1 to 10000"),
-        (["--fit-faces", "--compare"], "--fit-faces: is for one run"),
-    ):
-        assert told in complaint(capsys, "evaluate", str(tmp_path / "W"), *more)

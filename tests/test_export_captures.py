@@ -22,9 +22,9 @@ from mien.camera import Camera
 from mien.capture import write_capture
 from mien.capture.store import read_capture_hash
 from mien.cli import main
-from mien.datasets import matting, overlay, sequences
+from mien.datasets import overlay, pictures, sequences
 from mien.datasets.layouts.filmed import Filmed, filmed_frames
-from mien.datasets.layouts.registry import find_layout
+from mien.datasets.layouts.layout import find_layout
 from mien.datasets.layouts.writing import write_layout
 from mien.datasets.pictures import read_picture
 from mien.datasets.sequences import tracked_sequence
@@ -97,7 +97,7 @@ def _undetected(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the detector and the network of mattes, which find nothing in drawings this small."""
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)
     monkeypatch.setattr(sequences, "detected_landmarks", lambda images: np.full((*images.shape[:2], 478, 2), 5.0))
-    monkeypatch.setattr(matting, "fill_mattes", lambda *_: None)
+    monkeypatch.setattr(pictures, "fill_mattes", lambda *_: None)
 
 
 def filmed(sequence: Sequence, scene: Scene, **settings: Any) -> Filmed:

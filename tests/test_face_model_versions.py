@@ -16,8 +16,7 @@ from dataset_writers import write_benchmark, write_flash_avatar, write_imavatar,
 from flame_like import write_npz
 from mien.datasets import overlay
 from mien.datasets.dataset import TrackedSequence
-from mien.datasets.overlay import check_overlay
-from mien.datasets.steadiness import Steadiness, measure_steadiness
+from mien.datasets.overlay import Steadiness, check_overlay, measure_steadiness
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.models.flame import flame_face_model, read_flame

@@ -18,7 +18,7 @@ from mien.disk.workspace import Workspace
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.driving.sources.blendshape_json import read_blendshape_json
 from mien.driving.sources.live_link_face import read_live_link_face
-from mien.evaluation.image_source import open_pictures
+from mien.evaluation.image_folders import open_pictures
 from mien.media.source import list_images
 from mien.pipeline import drive as driving
 from recordings import live_link_face, row, write_csv, write_json

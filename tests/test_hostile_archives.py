@@ -17,8 +17,7 @@ from flame_like import flame_like, write_npz
 from fuzzing.dataset_faults import RunsCode
 from fuzzing.formats import npy_of, zip_of
 from fuzzing.kinds import SMALL_PICKLES
-from mien.datasets.arrays import read_npy, read_some_arrays
-from mien.datasets.content import inner, numbers, read_object
+from mien.datasets.content import inner, numbers, read_npy, read_object, read_some_arrays
 from mien.datasets.metrical_tracker import read_tracker_frames
 from mien.face import load_face_model
 from mien.face.models import inert_pickle, npz
@@ -37,7 +36,7 @@ def test_a_pickle_takes_no_more_than_its_own_size(tmp_path: Path, monkeypatch: p
     refused(read_flame, path, "too many for a face model", 24 * MIB)
     for data in SMALL_PICKLES.values():
         path.write_bytes(data)
-        refused(read_flame, path, r"is not a pickle, or is damaged|has no 'v_template'|not named arrays", 24 * MIB)
+        refused(read_flame, path, r"cannot be read as a pickle|has no 'v_template'", 24 * MIB)
     monkeypatch.setattr(inert_pickle, "MAX_MODEL_BYTES", 8 * MIB)
     one = np.zeros(MIB // 8)
     path.write_bytes(pickle.dumps({f"name{i}": one for i in range(20)}, protocol=2))

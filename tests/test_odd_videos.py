@@ -22,7 +22,7 @@ from mien.capture.person.crop import whole_picture
 from mien.capture.person.given import GivenMattes
 from mien.cli import main
 from mien.errors import UserError
-from mien.evaluation.image_source import read_picture
+from mien.evaluation.image_folders import read_picture
 from mien.media.decoding import MAX_PICTURE_PIXELS, announced_size, decode_picture
 from mien.media.display import Display
 from mien.media.output import plan_output

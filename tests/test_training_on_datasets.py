@@ -23,7 +23,7 @@ from mien.batch.row import run_row
 from mien.batch.steps import do_with
 from mien.cli import main
 from mien.commands.batch_table import read_table
-from mien.datasets import matting, overlay, sequences
+from mien.datasets import overlay, pictures, sequences
 from mien.evaluation import evaluate
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
@@ -182,7 +182,7 @@ def test_an_import_is_trained_on_and_scored_by_its_protocol(layout: str, tmp_pat
     given, root = write(tmp_path / "me", scene), tmp_path / "W"
     # NeRFace has no landmarks and no mattes, and the networks know no drawings this small.
     monkeypatch.setattr(sequences, "detected_landmarks", lambda images: writers.nerface_landmarks(scene, images))
-    monkeypatch.setattr(matting, "fill_mattes", not_white)
+    monkeypatch.setattr(pictures, "fill_mattes", not_white)
     assert main(["import", str(given), "--out", str(root), "--face-model", MODELS.get(layout, "flame")]) == 0
     line = ["train", str(root), "--method", method, "--split", split, "--preset", "draft"]
     assert main([*line, "--training.resolution", "96", *SMALL[method], *PLAIN]) == 0

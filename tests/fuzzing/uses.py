@@ -40,7 +40,7 @@ from mien.driving.sources.blendshape_json import read_blendshape_json
 from mien.driving.sources.live_link_face import read_live_link_face
 from mien.errors import UserError
 from mien.evaluation import evaluate
-from mien.evaluation.image_source import open_pictures, read_picture
+from mien.evaluation.image_folders import open_pictures, read_picture
 from mien.evaluation.metrics_file import read_metrics
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.listing import available_face_models

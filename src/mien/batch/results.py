@@ -12,7 +12,7 @@ from typing import Any
 from mien.batch.plan import Batch
 from mien.disk.files import write_atomically
 from mien.errors import UserError
-from mien.pages.metric_names import COLUMNS
+from mien.pages.pages import COLUMNS
 
 HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
 HIGHER = {name: higher for name, _, _, higher in COLUMNS}

@@ -61,13 +61,13 @@ def _sample(step: str, stages: dict[str, float], ended: threading.Event) -> None
 
 def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
     """The figures of a run as they come into the results: one value each. Writes the run's thumbnail as well."""
-    from mien.evaluation.metrics_file import figure, read_figures
-    from mien.pages.metric_names import METRICS
+    from mien.evaluation.metrics_file import figure, read_metrics
+    from mien.pages.pages import METRICS
     from mien.training.run import read_run_config
 
     found: dict[str, Any] = {"run": run_dir.name, "method": read_run_config(run_dir)["method"]["kind"]}
     if (run_dir / "metrics.json").is_file():
-        content = read_figures(run_dir)
+        content = read_metrics(run_dir)
         scored = next((each for each in content["protocols"].values() if "psnr" in each), None)
         for part, prefix in ((None, ""), ("head", "head_")):
             for metric in METRICS:

@@ -134,7 +134,7 @@ class Command:
         return default if self.perceptual_frames is None else self.perceptual_frames
 
     def _compare(self) -> None:
-        from mien.evaluation.report.text import comparison_text
+        from mien.evaluation.text import comparison_text
         from mien.pipeline.evaluate import run_comparison
 
         comparison = run_comparison([open_workspace(folder) for folder in self.workspaces], self.run_name, self.out)
@@ -154,8 +154,8 @@ class Command:
 
     def _score_images(self, images: Path, truth: Path) -> None:
         from mien.evaluation.image_folders import ImageFolders, score_folders, write_scores
-        from mien.evaluation.report.text import scores_lines
         from mien.evaluation.scoring import ScoreSettings
+        from mien.evaluation.text import scores_lines
 
         folders = ImageFolders(images, truth, self.mattes, self.crops, self.background)
         scores = score_folders(

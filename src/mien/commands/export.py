@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from mien.commands.parsing.help_text import Described
-from mien.datasets.layouts.layout import Layout, MatteKind
-from mien.datasets.layouts.registry import LAYOUTS, find_layout
+from mien.datasets.layouts.layout import LAYOUTS, Layout, MatteKind, find_layout
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, Holds

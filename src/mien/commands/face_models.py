@@ -46,8 +46,7 @@ class Command:
 
     def run(self) -> None:
         """Add or bake a model if asked for, then print the table."""
-        from mien.face.listing import available_face_models
-        from mien.face.obtainable import OBTAINABLE
+        from mien.face.listing import OBTAINABLE, available_face_models
 
         if self.add is not None:
             from mien.face.cache import cache_is_kept

@@ -1,6 +1,6 @@
 """Datasets: folders of other programs and laboratories, each with the file that recognises and reads it.
 
-`registry` lists them and `dataset` says what one is. Readers use `arrays`, and `sequences` makes what they return.
+`registry` lists them and `dataset` says what one is. Readers use `content`, and `sequences` makes what they return.
 `writing` puts that into a workspace.
 """
 

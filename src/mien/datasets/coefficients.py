@@ -1,6 +1,6 @@
 """Sequences with poses and coefficients of a head model that is not published.
 
-They get a head that the coefficients do not move (`mien.face.models.coefficients`). The poses are in that model's own
+They get a head that the coefficients do not move (`mien.face.loading`). The poses are in that model's own
 axes and unit. One turn, one shift and one scale lead to them from mien's head frame. They are found by landmarks.
 """
 
@@ -16,19 +16,17 @@ from jaxtyping import Float
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, ReadSequence, TrackedSequence
 from mien.datasets.flame_poses import AXES, FRONT, axis_angles, camera_of
+from mien.datasets.overlay import spread_out
 from mien.datasets.sequences import tracked_sequence
 from mien.errors import UserError
+from mien.face.loading import coefficient_count
 from mien.face.model import FaceModel
-from mien.face.models.coefficients import coefficient_count
 
 Place = tuple[Float[np.ndarray, "3 3"], float, Float[np.ndarray, " 3"]]
 """Turn R, scale s and shift d of mien's head in the axes of other poses: x -> s R x + d."""
-_MARKS, _FACE_MARKS = "mediapipe", 468
-"""The landmarks of mien's detector, and how many of them are not on the irises."""
-_FRAMES, _EVERY = 40, 6
-"""Most frames, and every how many landmarks, by which the place is found."""
-_CORNERS = (33, 263)
-"""MediaPipe's points at the outer corners of the eyes."""
+_MARKS, _FACE_MARKS = "mediapipe", 468  # the landmarks of mien's detector, and how many of them are not on the irises
+_FRAMES, _EVERY = 40, 6  # most frames, and every how many landmarks, by which the place is found
+_CORNERS = (33, 263)  # MediaPipe's points at the outer corners of the eyes
 _MAX_DISTANCE = 0.25
 """Largest median distance of landmarks from those of the pictures, over that of the outer corners of the eyes. The mean
 head has about 0.1."""
@@ -56,11 +54,8 @@ def with_coefficients(
 ) -> tuple[TrackedSequence, Place]:
     """Return the sequence with its authors' poses and coefficients as its tracking, and the place of the head.
 
-    Args:
-        path: The dataset, for messages.
-        sequence: A sequence of one camera, with `expression` and `head_to_camera` among its foreign arrays.
-        face_model: The face model `coefficients-N`, with as many coefficients as the sequence has.
-        place: The place of the head (`head_place`). None finds it.
+    It has one camera, and `expression` and `head_to_camera` among its foreign arrays. `place` is that of the head
+    (`head_place`), or None to find it.
     """
     capture, coefficients = sequence.capture, sequence.foreign["expression"]
     poses = sequence.foreign["head_to_camera"].astype(np.float64)
@@ -72,7 +67,7 @@ def with_coefficients(
     assert capture.calibration is not None
     K = capture.calibration[0].K.double().numpy()
     usable = np.flatnonzero(capture.valid[:, 0])
-    usable = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).round().astype(int))]
+    usable = usable[spread_out(len(usable), _FRAMES)]
     points = face_model.landmark_positions(face_model.head_vertices(face_model.neutral()), _MARKS)[0]
     marks, seen = points[:_FACE_MARKS].double().numpy(), capture.landmarks[usable, 0, :_FACE_MARKS].astype(np.float64)
     if place is None:
@@ -103,11 +98,8 @@ def head_place(
 ) -> Place:  # fmt: skip
     """Return the place of the head in the axes of the poses.
 
-    Args:
-        marks: Landmarks of the head at rest, in metres.
-        seen: The same in pictures, in pixels.
-        poses: From the axes of the other head to those of the camera, in any unit.
-        K: Intrinsics of the camera.
+    `marks` are landmarks of the head at rest, in metres, and `seen` the same in pictures, in pixels. `poses` lead from
+    the axes of the other head to those of the camera, in any unit.
     """
     from scipy.optimize import least_squares
 

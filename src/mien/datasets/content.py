@@ -1,9 +1,9 @@
-"""Files of strangers inside a dataset: paths that stay in it, json with checked numbers, pictures of checked sizes.
+"""Files of strangers inside a dataset: paths that stay in it, json and arrays with checked numbers and shapes.
 
-This file needs no torch, because datasets are surveyed before any work.
+Nothing in them is run, and their size is limited. This file needs no torch: datasets are surveyed before any work.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,35 +13,24 @@ from mien.disk.inside import is_one_line
 from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import open_ordinary, parse_json, read_bytes
 from mien.errors import UserError
+from mien.face.models.npz import parse_npy, read_npz, readable
 
 REMEDY = "copy the files of the dataset again"
-_MAX_JSON_BYTES = 512 << 20
-"""Largest json file in bytes. The json of 20,000 frames with 100 numbers each has some 50 MB."""
-_MAX_SNIFFED = 1 << 20
-_MAX_SHOWN = 60
-"""Most characters of a name that a message shows."""
-_MAX_NAME = 500
-"""Most characters of the name of a file, with its folders in the dataset."""
 
 
 def sniff(path: Path) -> bytes:
     """Return the beginning of a file, in which the keys of a json's first frame are; nothing if it cannot be read."""
     try:
         with open_ordinary(path) as file:
-            return file.read(_MAX_SNIFFED)
+            return file.read(1 << 20)
     except (OSError, ValueError):
         return b""
 
 
 def read_object(path: Path) -> dict[str, Any]:
     """Read a json object. Its numbers may be NaN, because those that are used are checked by `numbers`."""
-    try:
-        content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"), constants=True)
-    except FileNotFoundError:
-        raise UserError(f"{path}: is missing; {REMEDY}") from None
-    except (OSError, ValueError) as error:  # UnicodeDecodeError is a ValueError
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as json ({reason}); {REMEDY}") from None
+    with readable(path, "json", REMEDY):
+        content = parse_json(read_bytes(path, 512 << 20).decode("utf-8"), constants=True)  # of 20,000 frames: 50 MB
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds no object with names; {REMEDY}")
     return content
@@ -61,11 +50,7 @@ def frames_of(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
 def numbers(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
     """Return an entry of a json object as a float64 array.
 
-    Args:
-        path: The file, for messages.
-        content: The object.
-        name: The entry's name.
-        shape: Its shape. None stands for any length above 0, and () for a single number.
+    In the shape that it must have, None stands for any length above 0, and () is that of a single number.
     """
     if name not in content:
         raise UserError(f"{path}: has no {name!r}; {REMEDY}")
@@ -83,6 +68,23 @@ def numbers(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int 
     return values
 
 
+def scalars(path: Path, content: Mapping[str, Any], *names: str) -> tuple[float, ...]:
+    """Return entries of a json object that are single numbers."""
+    return tuple(float(numbers(path, content, name, ())) for name in names)
+
+
+def stacked(path: Path, frames: Sequence[Mapping[str, Any]], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an entry of each frame [t, *shape]."""
+    return np.stack([numbers(path, frame, name, shape) for frame in frames])
+
+
+def stacked_poses(
+    path: Path, frames: Sequence[Mapping[str, Any]], name: str, shape: tuple[int, ...] = (4, 4)
+) -> np.ndarray:
+    """Return a rigid motion of each frame [t, *shape], after a check of its rotation."""
+    return np.stack([rotation_part(path, name, matrix) for matrix in stacked(path, frames, name, shape)])
+
+
 def rotation_part(path: Path, name: str, matrix: np.ndarray) -> np.ndarray:
     """Return the matrix after a check that its first three columns and rows are orthonormal, up to a reflection."""
     rotation = matrix[:3, :3]
@@ -92,16 +94,12 @@ def rotation_part(path: Path, name: str, matrix: np.ndarray) -> np.ndarray:
 
 
 def inner(path: Path, root: Path, name: object, endings: Sequence[str] = ("",)) -> Path:
-    """Return the path of a file that another file of the dataset names.
+    """Return the path of a file inside `root` that the file `path` names, relative to its own folder.
 
-    Args:
-        path: The file that names it, for messages. The name is relative to its folder.
-        root: The folder that the named file must be in.
-        name: The name.
-        endings: Endings that the name may lack; the first one whose file exists is added.
+    The name may lack one of the endings; the first one whose file exists is added.
     """
-    if not is_one_line(name) or not 0 < len(str(name)) <= _MAX_NAME or Path(str(name)).is_absolute():
-        raise UserError(f"{path}: {str(name)[:_MAX_SHOWN]!r} is not the name of a file in the dataset; {REMEDY}")
+    if not is_one_line(name) or not 0 < len(str(name)) <= 500 or Path(str(name)).is_absolute():
+        raise UserError(f"{path}: {str(name)[:60]!r} is not the name of a file in the dataset; {REMEDY}")
     named = path.parent / str(name)
     for ending in endings:
         place = named.with_name(named.name + ending)
@@ -153,3 +151,40 @@ def _is_numeric(content: Any) -> bool:
     if isinstance(content, list):
         return all(map(_is_numeric, content))
     return isinstance(content, (int, float)) and not isinstance(content, bool)
+
+
+def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Return arrays of an .npz by name. Floating point numbers become float32, and other types stay.
+
+    `axes` has a letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
+    a length. `sizes` are lengths that are known, by letter.
+    """
+    with readable(path, ".npz", REMEDY):
+        arrays = read_npz(path, tuple(axes))[1]
+    known = {**{str(digit): digit for digit in range(10)}, **sizes}
+    for name, letters in axes.items():
+        if name not in arrays:
+            raise UserError(f"{path}: has no {name!r}; {REMEDY}")
+        shape = arrays[name].shape
+        expected = [known.setdefault(letter, size) for letter, size in zip(letters, shape, strict=False)]
+        if len(letters) != len(shape) or list(shape) != expected or 0 in shape:
+            raise UserError(
+                f"{path}: {name!r} has the shape {list(shape)}, which is not [{', '.join(letters)}]; {REMEDY}"
+            )
+    return {name: each.astype(np.float32) if each.dtype.kind == "f" else each for name, each in arrays.items()}
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """Return the array of an .npy file of plain numbers."""
+    with readable(path, ".npy", REMEDY):
+        return parse_npy(read_bytes(path, 16 << 20))
+
+
+def read_some_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Return those of the named arrays of an .npz that it has, as float64, after a check of their numbers."""
+    with readable(path, ".npz", REMEDY):
+        arrays = read_npz(path, names)[1]
+    for name, array in arrays.items():
+        if array.size and not np.abs(array.astype(np.float64)).max() <= MAX_NUMBER:
+            raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {REMEDY}")
+    return {name: array.astype(np.float64) for name, array in arrays.items()}

@@ -22,13 +22,7 @@ FRONT = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def needed_flame(path: Path, face_model: FaceModel | None, version: str) -> FaceModel:
-    """Return the face model that the user named, which has to be in FLAME's schema.
-
-    Args:
-        path: The dataset, for messages.
-        face_model: The face model, or None.
-        version: The version of FLAME that the dataset's tracking belongs to.
-    """
+    """Return the face model that the user named, which has to be FLAME of the version that the tracking belongs to."""
     if face_model is None:
         raise UserError(
             f"{path}: its tracking needs {version}, which mien may not contain; give it with --face-model FILE.pkl "
@@ -45,10 +39,7 @@ def needed_flame(path: Path, face_model: FaceModel | None, version: str) -> Face
 def face_of_flame(path: Path, face_model: FaceModel, arrays: Mapping[str, np.ndarray]) -> FaceParams:
     """Return face parameters from some of the arrays of flame_param.npz. Missing poses are at rest.
 
-    Args:
-        path: The dataset, for messages.
-        face_model: A face model in FLAME's schema.
-        arrays: `shape` [n] and `expr` [t, e], and perhaps others (`mien.formats.face_of_flame_params`).
+    They are `shape` [n] and `expr` [t, e], and perhaps others (`mien.formats.face_of_flame_params`).
     """
     t = len(arrays["expr"])
     rest = {name: np.zeros((t, 3)) for name in ("rotation", "translation", "neck_pose", "jaw_pose")}
@@ -65,19 +56,22 @@ def carried(
     return replace(face, head_rotation=axis_angle_from_matrix(turns @ pose).float(), head_translation=place.float())
 
 
-def in_front(face: FaceParams, viewmats: Float[np.ndarray, "t 4 4"]) -> FaceParams:
+def in_front(face: FaceParams, viewmats: Float[np.ndarray, "*t 4 4"]) -> FaceParams:
     """Return faces seen by a moving camera as moving faces seen by the camera `FRONT`.
 
-    Args:
-        face: The faces, in the world of the moving camera.
-        viewmats: World-to-camera matrix of each timestep, with OpenCV's axes.
+    `viewmats` are world-to-camera matrices with OpenCV's axes: one for each timestep, or one of a camera that stands.
     """
-    return carried(face, AXES @ viewmats[:, :3, :3], viewmats[:, :3, 3] @ AXES)
+    return carried(face, AXES @ viewmats[..., :3, :3], viewmats[..., :3, 3] @ AXES)
 
 
 def camera_of(K: Float[np.ndarray, "3 3"], viewmat: Float[np.ndarray, "4 4"], size: tuple[int, int]) -> Camera:
     """Return a camera for pictures of this width and height."""
     return Camera(torch.tensor(K, dtype=torch.float32), torch.tensor(viewmat, dtype=torch.float32), *size)
+
+
+def viewmats_from_opengl(poses: Float[np.ndarray, "*t 4 4"]) -> Float[np.ndarray, "*t 4 4"]:
+    """World-to-camera matrices with OpenCV's axes, from camera-to-world matrices with OpenGL's."""
+    return np.linalg.inv(poses @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:

@@ -9,26 +9,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, rotation_part, sniff
+import numpy as np
+
+from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, sniff, stacked, stacked_poses
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mien.face.model import FaceModel
+    from mien.face.params import FaceParams
 
 _FILE = "flame_params.json"
 _VERSION = "FLAME 2020 (generic_model.pkl)"
 _FPS = 25.0
-_SCALE = 4.0
-"""Size of the data set's world in metres' units: a head is four times as large."""
-_OLD_SIZE = 512
-"""Width of the pictures of the old format, whose intrinsics are in pixels."""
+_SCALE = 4.0  # size of the data set's world in metres' units: a head is four times as large
+_OLD_SIZE = 512  # width of the pictures of the old format, whose intrinsics are in pixels
 _TEST = ("MVI_1812", "MVI_1802", "test", "wlz0318_test")
 """Clips that the authors hold out as a whole. The other clips of the same subject are trained on."""
-_TAIL = 350
-"""Number of frames at the end that SplattingAvatar holds out of its one clip."""
+_TAIL = 350  # number of frames at the end that SplattingAvatar holds out of its one clip
 _ENDINGS = (".png", ".jpg", "")
 _CLOTHES = (15, 16)
 """Classes of `semantic` that MonoGaussianAvatar leaves out of its second set of figures: necklace and cloth."""
@@ -99,7 +97,7 @@ def _survey(path: Path) -> Findings:
     return Findings(tuple(Clip(clip.name, len(clip.frames)) for clip in clips), "FLAME 2020", split, tuple(missing))
 
 
-def camera_from_imavatar(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
+def camera_from_imavatar(intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Intrinsics in pixels from the four of the file, which are relative to the picture's size.
 
     Rays go through whole pixels there, which are the corners of pixels here, so half a pixel is added to the centre.
@@ -112,7 +110,7 @@ def camera_from_imavatar(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np
     return pinhole(abs(fx) * width, abs(fy) * height, cx * width + 0.5, cy * height + 0.5)
 
 
-def pose_from_imavatar(world_mats: "np.ndarray") -> "tuple[np.ndarray, np.ndarray]":
+def pose_from_imavatar(world_mats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and translations [t, 3, 3], [t, 3] from FLAME's world to that of the camera `flame_poses.FRONT`.
 
     The cameras' axes are those of that world, because OpenCV's axes are turned twice.
@@ -120,29 +118,22 @@ def pose_from_imavatar(world_mats: "np.ndarray") -> "tuple[np.ndarray, np.ndarra
     return world_mats[:, :3, :3], world_mats[:, :3, 3] / _SCALE
 
 
-def _pictures(clip: _Clip, root: Path) -> "tuple[np.ndarray, np.ndarray]":
-    import numpy as np
-
-    from mien.datasets.pictures import collect, read_matte, read_picture
+def _pictures(clip: _Clip, root: Path) -> tuple[np.ndarray, np.ndarray]:
+    from mien.datasets.pictures import read_matte, read_one_camera
 
     places = [inner(clip.file, root, frame.get("file_path"), _ENDINGS) for frame in clip.frames]
-    first = read_picture(places[0])[0]
-    size = first.shape[1], first.shape[0]
 
-    def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
-        colors, matte = read_picture(places[timestep], size)
-        beside = clip.file.parent / "mask" / places[timestep].name
-        if matte is None or beside.exists():
-            matte = read_matte(inner(clip.file, root, f"mask/{places[timestep].name}"), size)
-        return colors, matte
+    def matte(timestep: int, opacity: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
+        name = f"mask/{places[timestep].name}"
+        if opacity is not None and not (clip.file.parent / name).exists():
+            return opacity
+        return read_matte(inner(clip.file, root, name), size)
 
-    return collect(len(places), 1, size, read, f"read {clip.name}")
+    return read_one_camera(places, clip.name, matte)
 
 
-def _clothes(clip: _Clip, root: Path, size: tuple[int, int]) -> "dict[str, np.ndarray]":
+def _clothes(clip: _Clip, root: Path, size: tuple[int, int]) -> dict[str, np.ndarray]:
     """Packed masks of clothes by the pictures of classes; nothing if the clip has none."""
-    import numpy as np
-
     from mien.datasets.pictures import read_matte
     from mien.training.footage.clothes import packed_clothes
 
@@ -156,55 +147,45 @@ def _clothes(clip: _Clip, root: Path, size: tuple[int, int]) -> "dict[str, np.nd
     return {name: np.concatenate([mask[name] for mask in masks]) for name in masks[0]}
 
 
-def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    import numpy as np
+def _face(clip: _Clip, model: "FaceModel") -> "FaceParams":
+    from mien.datasets.flame_poses import carried, face_of_flame
 
-    from mien.datasets.flame_poses import FRONT, camera_of, carried, face_of_flame, needed_flame
-    from mien.datasets.overlay import check_overlay
-    from mien.datasets.sequences import tracked_sequence
-
-    model, clips = needed_flame(path, face_model, _VERSION), _clips(path)
-    held = _held_out(clips)
-    for clip in clips:
-        file = clip.file
-        poses = np.stack([numbers(file, frame, "pose", (15,)) for frame in clip.frames])
-        mats = np.stack(
-            [rotation_part(file, "world_mat", numbers(file, frame, "world_mat", (3, 4))) for frame in clip.frames]
-        )
-        arrays = {
-            "shape": numbers(file, clip.content, "shape_params", (None,)),
-            "expr": np.stack([numbers(file, frame, "expression", (50,)) for frame in clip.frames]),
-            "rotation": poses[:, :3], "neck_pose": poses[:, 3:6], "jaw_pose": poses[:, 6:9], "eyes_pose": poses[:, 9:],
-        }  # fmt: skip
-        face = carried(face_of_flame(file, model, arrays), *pose_from_imavatar(mats))
-        images, mattes = _pictures(clip, path)
-        size = images.shape[3], images.shape[2]
-        K = camera_from_imavatar(numbers(file, clip.content, "intrinsics", (4,)), size)
-        camera = {"0": camera_of(K, FRONT, size)}
-        sequence = tracked_sequence(file, clip.name, images, mattes, camera, model, face, _FPS)
-        sequence = replace(check_overlay(file, sequence, _VERSION), foreign=_clothes(clip, path, size))
-        yield _with_split(sequence, held)
+    file, frames = clip.file, clip.frames
+    poses, mats = stacked(file, frames, "pose", (15,)), stacked_poses(file, frames, "world_mat", (3, 4))
+    arrays = {
+        "shape": numbers(file, clip.content, "shape_params", (None,)),
+        "expr": stacked(file, frames, "expression", (50,)),
+        "rotation": poses[:, :3], "neck_pose": poses[:, 3:6], "jaw_pose": poses[:, 6:9], "eyes_pose": poses[:, 9:],
+    }  # fmt: skip
+    return carried(face_of_flame(file, model, arrays), *pose_from_imavatar(mats))
 
 
-def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.datasets.flame_poses import FRONT, camera_of
-    from mien.datasets.sequences import filmed_sequence
+    from mien.datasets.sequences import sequence_of
+    from mien.training.splits.own import OwnSplit
 
     clips = _clips(path)
     held = _held_out(clips)
     for clip in clips:
+        tracked = None if model is None else (model, _face(clip, model))
         images, mattes = _pictures(clip, path)
         size = images.shape[3], images.shape[2]
         K = camera_from_imavatar(numbers(clip.file, clip.content, "intrinsics", (4,)), size)
         camera = {"0": camera_of(K, FRONT, size)}
-        sequence = filmed_sequence(clip.file, clip.name, images, mattes, camera, _FPS)
-        yield _with_split(replace(sequence, foreign=_clothes(clip, path, size)), held)
+        sequence = sequence_of(clip.file, clip.name, (images, mattes), camera, _FPS, tracked, _VERSION)
+        split = OwnSplit(held[clip.name]) if held else None
+        yield replace(sequence, own_split=split, foreign=_clothes(clip, path, size))
 
 
-def _with_split(sequence: Any, held: dict[str, tuple[tuple[int, int], ...]]) -> ReadSequence:
-    from mien.training.splits.own import OwnSplit
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import needed_flame
 
-    return replace(sequence, own_split=OwnSplit(held[sequence.capture.name]) if held else None)
+    return _sequences(path, needed_flame(path, face_model, _VERSION))
+
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    return _sequences(path, None)
 
 
 IMAVATAR = Dataset(

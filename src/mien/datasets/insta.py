@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mien.datasets.content import (
     REMEDY,
     check_file_inside,
@@ -24,25 +26,24 @@ from mien.datasets.content import (
     numbers,
     png_has_opacity,
     read_object,
-    rotation_part,
+    scalars,
     sniff,
+    stacked_poses,
 )
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
 from mien.machine.terminal import counted
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mien.face.model import FaceModel
+    from mien.training.splits.own import OwnSplit
 
 _FPS = 25.0
 TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
 """Number of frames at the end that the authors hold out."""
 _TEST = "transforms_test.json"
 _LARGER = "images.HQ"
-_FOLDERS = ("images", _LARGER, "matted", "input")
-"""Folders with pictures, of which the first one is used."""
+_FOLDERS = ("images", _LARGER, "matted", "input")  # folders with pictures, of which the first one is used
 _MASKS = "image_mask"
 
 
@@ -162,19 +163,11 @@ def _survey(path: Path) -> Findings:
     return Findings(clips, "FLAME 2020" if tracked else None, split, tuple(missing))
 
 
-def scaled_to_pictures(
-    path: Path, K: "np.ndarray", tracked: tuple[int, int] | None, size: tuple[int, int]
-) -> "np.ndarray":
+def scaled_to_pictures(path: Path, K: np.ndarray, tracked: tuple[int, int] | None, size: tuple[int, int]) -> np.ndarray:
     """Return intrinsics for pictures that are larger than those that were tracked, by a whole factor.
 
-    Args:
-        path: The dataset, for messages.
-        K: Intrinsics for the pictures that were tracked.
-        tracked: Width and height of these pictures. None stands for `size`.
-        size: Width and height of the pictures.
+    `tracked` is the width and height of these pictures, or None for `size`.
     """
-    import numpy as np
-
     width, height = size if tracked is None else tracked
     factor = max(size[0] // max(width, 1), 1)
     if (width * factor, height * factor) != size:
@@ -185,50 +178,25 @@ def scaled_to_pictures(
     return np.diag([factor, factor, 1.0]) @ K
 
 
-def _size(layout: _Layout) -> tuple[int, int]:
-    """Width and height of the pictures."""
-    from mien.datasets.pictures import read_picture
+def _pictures(layout: _Layout) -> tuple[np.ndarray, np.ndarray]:
+    from mien.datasets.pictures import read_matte, read_one_camera
 
-    first = read_picture(layout.frames[0].picture)[0]
-    return first.shape[1], first.shape[0]
-
-
-def _pictures(layout: _Layout, size: tuple[int, int]) -> "tuple[np.ndarray, np.ndarray]":
-    import numpy as np
-
-    from mien.datasets.matting import fill_mattes
-    from mien.datasets.pictures import collect, read_matte, read_picture
-
-    bare = layout.is_bare
-
-    def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+    def matte(timestep: int, opacity: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
         frame = layout.frames[timestep]
-        colors, matte = read_picture(frame.picture, size)
-        if frame.matte is not None:
-            matte = read_matte(frame.matte, size)
-        if bare:
-            matte = np.zeros((size[1], size[0]), np.uint8)
-        if matte is None:
+        found = opacity if frame.matte is None else read_matte(frame.matte, size)
+        if found is None:
             raise UserError(f"{frame.picture}: has no opacity and no matte; copy the folder with the mattes as well")
-        return colors, matte
+        return found
 
-    images, mattes = collect(len(layout.frames), 1, size, read, f"read {layout.name}")
-    if bare:
-        fill_mattes(images, mattes)
-    return images, mattes
-
-
-def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
-    from mien.training.splits.own import OwnSplit, ranges_of
-
-    return replace(sequence, own_split=OwnSplit(ranges_of(list(layout.test)))) if layout.test else sequence
+    places = [frame.picture for frame in layout.frames]
+    return read_one_camera(places, layout.name, None if layout.is_bare else matte)
 
 
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.datasets.flame_poses import FRONT, camera_of, needed_flame
     from mien.datasets.metrical_tracker import VERSION, read_tracker_frames
-    from mien.datasets.overlay import check_overlay
-    from mien.datasets.sequences import tracked_sequence
+    from mien.datasets.pictures import picture_size
+    from mien.datasets.sequences import sequence_of
     from mien.machine.progress import say
 
     layout = _layout(path)
@@ -240,11 +208,17 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     found = read_tracker_frames(checkpoints, model)
     if found.blinks:
         say(f"{layout.name}: lids are closed in {found.blinks:.0%} of the frames, which FLAME's parameters do not show")
-    size = _size(layout)
-    camera = camera_of(scaled_to_pictures(path, found.camera.K, found.camera.size, size), FRONT, size)
-    images, mattes = _pictures(layout, size)
-    sequence = tracked_sequence(path, layout.name, images, mattes, {"0": camera}, model, found.face, _FPS)
-    yield _with_split(check_overlay(path, sequence, VERSION), layout)
+    size = picture_size(layout.frames[0].picture)
+    camera = {"0": camera_of(scaled_to_pictures(path, found.camera.K, found.camera.size, size), FRONT, size)}
+    tracked = model, found.face
+    sequence = sequence_of(path, layout.name, _pictures(layout), camera, _FPS, tracked, VERSION)
+    yield replace(sequence, own_split=_own_split(layout))
+
+
+def _own_split(layout: _Layout) -> "OwnSplit | None":
+    from mien.training.splits.own import OwnSplit, ranges_of
+
+    return OwnSplit(ranges_of(list(layout.test))) if layout.test else None
 
 
 def _checkpoints(layout: _Layout) -> list[Path]:
@@ -255,10 +229,11 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     """Pictures with the camera of transforms.json, or without that file with the camera of the checkpoints."""
     from mien.datasets.flame_poses import FRONT, camera_of
     from mien.datasets.metrical_tracker import read_tracker_camera
+    from mien.datasets.pictures import picture_size
     from mien.datasets.sequences import filmed_sequence
 
     layout, file = _layout(path), path / "transforms.json"
-    size, poses = _size(layout), {}
+    size, poses = picture_size(layout.frames[0].picture), {}
     if file.exists():
         K, tracked, poses = _transforms(file)
     elif _checkpoints(layout):
@@ -266,26 +241,21 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         K, tracked = found.K, found.size
     else:
         raise UserError(f"{file}: is missing, and there are no checkpoints, so the camera is not known; {REMEDY}")
-    camera = camera_of(scaled_to_pictures(path, K, tracked, size), FRONT, size)
-    images, mattes = _pictures(layout, size)
-    sequence = filmed_sequence(path, layout.name, images, mattes, {"0": camera}, _FPS)
-    yield _with_split(replace(sequence, foreign=poses), layout)
+    camera = {"0": camera_of(scaled_to_pictures(path, K, tracked, size), FRONT, size)}
+    sequence = filmed_sequence(path, layout.name, *_pictures(layout), camera, _FPS)
+    yield replace(sequence, foreign=poses, own_split=_own_split(layout))
 
 
-def _transforms(file: Path) -> "tuple[np.ndarray, tuple[int, int] | None, dict[str, np.ndarray]]":
+def _transforms(file: Path) -> tuple[np.ndarray, tuple[int, int] | None, dict[str, np.ndarray]]:
     """Intrinsics, width and height that they are for, and poses of transforms.json."""
-    import numpy as np
-
     from mien.datasets.flame_poses import pinhole
 
     content = read_object(file)
-    K = pinhole(*(float(numbers(file, content, name, ())) for name in ("fl_x", "fl_y", "cx", "cy")))
+    K = pinhole(*scalars(file, content, "fl_x", "fl_y", "cx", "cy"))
     width, height = (int(numbers(file, content, name, ())) if name in content else 0 for name in ("w", "h"))
-    foreign = [numbers(file, frame, "transform_matrix", (4, 4)) for frame in frames_of(file, content)]
-    for matrix in foreign:
-        rotation_part(file, "transform_matrix", matrix)
-    poses = {"camera_to_head": np.stack(foreign).astype(np.float32)}
-    return K, (width, height) if width > 0 and height > 0 else None, poses
+    poses = stacked_poses(file, frames_of(file, content), "transform_matrix")
+    size = (width, height) if width > 0 and height > 0 else None
+    return K, size, {"camera_to_head": poses.astype(np.float32)}
 
 
 INSTA = Dataset(

@@ -10,14 +10,12 @@ from mien.datasets.nersemble import frames_in
 from mien.disk.inside import listed
 from mien.disk.reading import read_bytes
 from mien.errors import UserError
+from mien.face.models.npz import readable
 
 if TYPE_CHECKING:
     from mien.face.model import FaceModel
 
-_MAX_CSV_BYTES = 256 << 20
 _DEPTH = "depth_data.bin"
-DRIVER = "driving.csv"
-"""Name that the csv gets beside the capture."""
 
 
 def _video(path: Path) -> Path | None:
@@ -63,10 +61,8 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
     files = {}
     if table is not None:
         check_file_inside(path, table)
-        try:
-            files[DRIVER] = read_bytes(table, _MAX_CSV_BYTES)
-        except (OSError, ValueError) as error:
-            raise UserError(f"{table}: cannot be read ({' '.join(str(error).split())[:200]}); {REMEDY}") from None
+        with readable(table, "csv", REMEDY):
+            files["driving.csv"] = read_bytes(table, 256 << 20)
         from mien.driving.sources.live_link_face import read_live_link_face
 
         read_live_link_face(table)  # a damaged one is refused before the video is processed

@@ -19,22 +19,20 @@ from mien.disk.reading import MAX_SIDE, open_archive, open_member, open_ordinary
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.models.inert_pickle import parse_inert_pickle
+from mien.face.models.npz import readable
 from mien.face.params import FaceParams
 from mien.machine.progress import progress_bar
 
 VERSION = "FLAME 2020 (generic_model.pkl)"
-_MAX_FRAME_BYTES = 8 << 20
-"""Largest unpacked pickle in bytes. They have about 60 kB."""
+_MAX_FRAME_BYTES = 8 << 20  # largest unpacked pickle in bytes. They have about 60 kB
 _SHAPES = {
     "flame.exp": (1, 100), "flame.shape": (1, 300), "flame.jaw": (1, 6), "flame.eyes": (1, 12), "opencv.R": (1, 3, 3),
     "opencv.t": (1, 3), "opencv.K": (1, 3, 3),
 }  # fmt: skip
 _EYELIDS = "flame.eyelids"
 _SIZE = "img_size"
-_CLOSED = 0.3
-"""Number of an eyelid above which a blink counts."""
-_MAX_CHANGE = 0.005
-"""Largest relative change of a focal length in a sequence. The tracker keeps it constant."""
+_CLOSED = 0.3  # number of an eyelid above which a blink counts
+_MAX_CHANGE = 0.005  # largest relative change of a focal length in a sequence. The tracker keeps it constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +113,7 @@ def _camera(place: Path, arrays: dict[str, np.ndarray]) -> TrackerCamera:
 
 def _read_frame(path: Path) -> dict[str, np.ndarray]:
     """The arrays of one checkpoint, checked."""
-    try:
+    with readable(path, "a checkpoint of metrical-tracker", REMEDY):
         with open_ordinary(path) as file, open_archive(file) as archive:
             members = [member for member in archive.infolist() if member.filename.endswith("data.pkl")]
             if len(members) != 1:
@@ -125,13 +123,6 @@ def _read_frame(path: Path) -> dict[str, np.ndarray]:
             if len(data) > _MAX_FRAME_BYTES:
                 raise ValueError(f"its data.pkl has more than {_MAX_FRAME_BYTES:,} bytes")
         found = parse_inert_pickle(data)
-    except UserError:
-        raise
-    except FileNotFoundError:
-        raise UserError(f"{path}: is missing; {REMEDY}") from None
-    except Exception as error:  # a damaged archive may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as a checkpoint of metrical-tracker ({reason}); {REMEDY}") from None
     arrays = {}
     for name, shape in _SHAPES.items():
         array = found.get(name)

@@ -8,33 +8,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mien.datasets.content import (
     REMEDY,
     frames_of,
     inner,
     is_file_inside,
-    numbers,
     read_object,
-    rotation_part,
+    scalars,
     sniff,
+    stacked,
+    stacked_poses,
 )
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mien.face.model import FaceModel
 
 _FILE = "transforms.json"
 _FPS = 25.0
-_TAIL = 500
-"""Number of frames at the end that the authors hold out."""
+_TAIL = 500  # number of frames at the end that the authors hold out
 _COEFFICIENTS = 46
 _LANDMARKS = 478
-_HEAD = (0, 0, 255)
-"""Colour of the head in the parsing, as red, green and blue."""
-_MAX_LANDMARK_BYTES = 1 << 20
+_HEAD = (0, 0, 255)  # colour of the head in the parsing, as red, green and blue
 
 
 def _recognises(path: Path) -> str | None:
@@ -67,24 +65,15 @@ def _survey(path: Path) -> Findings:
     return Findings((Clip(path.name, len(frames)),), None, split, tuple(missing))
 
 
-def viewmats_from_nerf_blendshape(poses: "np.ndarray") -> "np.ndarray":
-    """World-to-camera matrices [t, 4, 4] with OpenCV's axes, from camera-to-world matrices with OpenGL's."""
-    import numpy as np
-
-    return np.linalg.inv(poses @ np.diag([1.0, -1.0, -1.0, 1.0]))
-
-
-def _read_landmarks(path: Path) -> "np.ndarray":
+def _read_landmarks(root: Path, path: Path) -> np.ndarray:
     """The 478 points of a .lms file in pixels; NaN if the file is missing."""
-    import numpy as np
-
     from mien.disk.reading import read_bytes
 
-    try:
-        text = read_bytes(path, _MAX_LANDMARK_BYTES).decode("ascii")
-        points = np.array(text.split(), np.float64).reshape(-1, 2)
-    except FileNotFoundError:
+    if not is_file_inside(root, path):
         return np.full((_LANDMARKS, 2), np.nan)
+    try:
+        text = read_bytes(path, 1 << 20).decode("ascii")
+        points = np.array(text.split(), np.float64).reshape(-1, 2)
     except (OSError, ValueError):
         points = np.zeros((0, 2))
     if points.shape != (_LANDMARKS, 2) or not np.abs(points).max() < 1e6:
@@ -93,44 +82,31 @@ def _read_landmarks(path: Path) -> "np.ndarray":
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    import numpy as np
-
-    from mien.datasets.flame_poses import FRONT, camera_of, pinhole
-    from mien.datasets.matting import fill_mattes
-    from mien.datasets.pictures import collect, read_picture
+    from mien.datasets.flame_poses import FRONT, camera_of, pinhole, viewmats_from_opengl
+    from mien.datasets.pictures import read_one_camera, read_picture
     from mien.datasets.sequences import filmed_sequence
     from mien.training.splits.own import OwnSplit
 
     file = path / _FILE
-    content, frames = _frames(path)
+    content, numbered = _frames(path)
+    frames = [frame for _, frame in numbered]
     folder = "ori_imgs" if (path / "ori_imgs").is_dir() else "head_imgs"
-    places = [inner(file, path, f"{folder}/{number}", (".jpg", ".png")) for number, _ in frames]
-    parsing = (path / "parsing").is_dir()
-    first = read_picture(places[0])[0]
-    size = first.shape[1], first.shape[0]
+    places = [inner(file, path, f"{folder}/{number}", (".jpg", ".png")) for number, _ in numbered]
 
-    def read(timestep: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
-        colors = read_picture(places[timestep], size)[0]
-        if not parsing:
-            return colors, np.zeros((size[1], size[0]), np.uint8)
-        classes = read_picture(inner(file, path, f"parsing/{frames[timestep][0]}", (".png",)), size)[0]
-        return colors, (classes == _HEAD).all(-1).astype(np.uint8) * 255
+    def matte(timestep: int, opacity: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
+        classes = read_picture(inner(file, path, f"parsing/{numbered[timestep][0]}", (".png",)), size)[0]
+        return (classes == _HEAD).all(-1).astype(np.uint8) * 255
 
-    images, mattes = collect(len(places), 1, size, read, f"read {path.name}")
-    if not parsing:
-        fill_mattes(images, mattes)
-    marks = [place.with_suffix(".lms") for place in places]
-    landmarks = np.stack([_read_landmarks(mark) if is_file_inside(path, mark) else _read_landmarks(path / "none.lms")
-                          for mark in marks])[:, None]  # fmt: skip
+    images, mattes = read_one_camera(places, path.name, matte if (path / "parsing").is_dir() else None)
+    landmarks = np.stack([_read_landmarks(path, place.with_suffix(".lms")) for place in places])[:, None]
     given = landmarks.astype(np.float32) if np.isfinite(landmarks).any() else None
-    fx, fy, cx, cy = (float(numbers(file, content, name, ())) for name in ("fx", "fy", "cx", "cy"))
+    fx, fy, cx, cy = scalars(file, content, "fx", "fy", "cx", "cy")
     # Rays go through whole pixels there, which are the corners of pixels here.
-    camera = {"0": camera_of(pinhole(fx, fy, cx + 0.5, cy + 0.5), FRONT, size)}
-    poses = np.stack([rotation_part(file, "transform_matrix", numbers(file, frame, "transform_matrix", (4, 4)))
-                      for _, frame in frames])  # fmt: skip
+    K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
+    camera = {"0": camera_of(K, FRONT, (images.shape[3], images.shape[2]))}
     foreign = {
-        "expression": np.stack([numbers(file, frame, "exp_ori", (_COEFFICIENTS,)) for _, frame in frames]),
-        "head_to_camera": viewmats_from_nerf_blendshape(poses),
+        "expression": stacked(file, frames, "exp_ori", (_COEFFICIENTS,)),
+        "head_to_camera": viewmats_from_opengl(stacked_poses(file, frames, "transform_matrix")),
     }
     count = len(frames)
     sequence = filmed_sequence(path, path.name, images, mattes, camera, _FPS, given)

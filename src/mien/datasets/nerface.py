@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mien.datasets.content import (
     REMEDY,
     check_file_inside,
@@ -16,16 +18,15 @@ from mien.datasets.content import (
     inner,
     numbers,
     read_object,
-    rotation_part,
     sniff,
+    stacked,
+    stacked_poses,
 )
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.disk.inside import listed
 from mien.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mien.face.model import FaceModel
 
 _CLIPS = ("train", "test")
@@ -57,7 +58,7 @@ def _in_time(path: Path, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     A row of it has the number of a picture of the whole clip, and its number among the training pictures or -1.
     """
-    from mien.datasets.arrays import read_npy
+    from mien.datasets.content import read_npy
 
     file = path / "index_map.npy"
     if not file.exists():
@@ -95,7 +96,7 @@ def _plates(path: Path) -> list[Path]:
     return listed(path, "bg/*.png")
 
 
-def camera_from_nerface(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
+def camera_from_nerface(intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Intrinsics in pixels. Rays go through whole pixels there, so half a pixel is added to the centre."""
     from mien.datasets.flame_poses import pinhole
 
@@ -103,13 +104,11 @@ def camera_from_nerface(intrinsics: "np.ndarray", size: tuple[int, int]) -> "np.
     return pinhole(abs(fx), abs(fy), cx * size[0] + 0.5, cy * size[1] + 0.5)
 
 
-def viewmats_from_nerface(poses: "np.ndarray", fx: float) -> "np.ndarray":
+def viewmats_from_nerface(poses: np.ndarray, fx: float) -> np.ndarray:
     """World-to-camera matrices [t, 4, 4] with OpenCV's axes, from camera-to-world matrices with OpenGL's.
 
     If fx is negative, the world is mirrored at x = 0, which makes proper cameras of mirrored ones.
     """
-    import numpy as np
-
     mirrored = fx < 0
     turn = -np.eye(3) if mirrored else np.diag([1.0, -1.0, -1.0])
     mirror = np.diag([-1.0, 1.0, 1.0]) if mirrored else np.eye(3)
@@ -120,34 +119,22 @@ def viewmats_from_nerface(poses: "np.ndarray", fx: float) -> "np.ndarray":
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    import numpy as np
-
     from mien.datasets.flame_poses import FRONT, camera_of
-    from mien.datasets.matting import fill_mattes
-    from mien.datasets.pictures import collect, read_picture
+    from mien.datasets.pictures import read_one_camera
     from mien.datasets.sequences import filmed_sequence
     from mien.training.splits.own import OwnSplit
 
+    plate = next(iter(_plates(path)), None)
+    if plate is not None:
+        check_file_inside(path, plate)
     for name, given in _clips(path).items():
         file, frames = _file(path, name), _in_time(path, given) if name == "train" else given
         places = [inner(file, path, frame.get("file_path"), _ENDINGS) for frame in frames]
-        first = read_picture(places[0])[0]
-        size = first.shape[1], first.shape[0]
         intrinsics = numbers(file, read_object(file), "intrinsics", (4,))
-
-        def read(
-            timestep: int, camera: int, places: list[Path] = places, size: tuple[int, int] = size
-        ) -> tuple[np.ndarray, np.ndarray]:
-            return read_picture(places[timestep], size)[0], np.zeros((size[1], size[0]), np.uint8)
-
-        images, mattes = collect(len(places), 1, size, read, f"read {name}")
-        plates = _plates(path)[:1]
-        for plate in plates:
-            check_file_inside(path, plate)
-        fill_mattes(images, mattes, read_picture(plates[0], size)[0] if plates else None)
-        poses = np.stack([rotation_part(file, "transform_matrix", numbers(file, frame, "transform_matrix", (4, 4)))
-                          for frame in frames])  # fmt: skip
-        expression = np.stack([numbers(file, frame, "expression", (_EXPRESSIONS,)) for frame in frames])
+        images, mattes = read_one_camera(places, name, None, plate)
+        size = images.shape[3], images.shape[2]
+        poses = stacked_poses(file, frames, "transform_matrix")
+        expression = stacked(file, frames, "expression", (_EXPRESSIONS,))
         foreign = {"expression": expression, "head_to_camera": viewmats_from_nerface(poses, float(intrinsics[0]))}
         camera = {"0": camera_of(camera_from_nerface(intrinsics, size), FRONT, size)}
         sequence = filmed_sequence(path, name, images, mattes, camera, _FPS)

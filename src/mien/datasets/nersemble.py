@@ -13,14 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, numbers, read_object, rotation_part
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.disk.inside import is_plain_name
 from mien.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mien.camera import Camera
     from mien.face.model import FaceModel
 
@@ -69,8 +69,6 @@ def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
     World-to-camera matrices are OpenCV's, in metres. Intrinsics are one matrix for all cameras, or one for each. Files
     that `mien export` wrote name the `image_size` that they are for; for others it is found by the principal point.
     """
-    import numpy as np
-
     from mien.datasets.flame_poses import camera_of
 
     content = read_object(file)
@@ -89,13 +87,11 @@ def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
     return cameras
 
 
-def scaled_intrinsics(K: "np.ndarray", size: tuple[int, int]) -> "np.ndarray":
+def scaled_intrinsics(K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Intrinsics for pictures of another size than `SIZE`. A principal point beyond the picture shows which they are.
 
     Raw calibrations are for full pictures. Those of the benchmark are for its own pictures already.
     """
-    import numpy as np
-
     width, height = size
     if K[0, 2] < width and K[1, 2] < height and K[0, 2] > 0.25 * width:
         return K
@@ -154,7 +150,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         )
 
 
-def _corrections(path: Path, serials: tuple[str, ...]) -> "dict[str, np.ndarray]":
+def _corrections(path: Path, serials: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Return the corrections of these cameras."""
     from mien.media.color_correction import color_correction
 

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.datasets.nersemble import FRONTAL, frames_in, has_mattes, read_cameras
@@ -16,8 +18,7 @@ from mien.errors import UserError
 from mien.training.splits.benchmark import HIDDEN_CAMERAS
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from mien.camera import Camera
     from mien.face.model import FaceModel
     from mien.training.splits.own import OwnSplit
 
@@ -26,8 +27,7 @@ TRACKING = "flame2023_tracking_v2.npz"
 TEST_ENDING = "-test"
 """End of the names of sequences that `mien export` writes of held-out frames. The benchmark itself has none."""
 FPS_MONO, FPS_VIEWS = 24.3, 73.0
-_MAX_ANGLE = 1e-4
-"""Largest difference of the two forms of a rotation."""
+_MAX_ANGLE = 1e-4  # largest difference of the two forms of a rotation
 
 
 def _sequences(path: Path) -> list[Path]:
@@ -73,9 +73,7 @@ def flame_from_benchmark(file: Path) -> "tuple[dict[str, np.ndarray], np.ndarray
 
     Rotations are those of `rotation_matrices`. The Euler angles of `rotation` must say the same.
     """
-    import numpy as np
-
-    from mien.datasets.arrays import read_arrays
+    from mien.datasets.content import read_arrays
 
     axes = {
         "shape": "1s", "expression": "te", "rotation": "t3", "rotation_matrices": "t33", "translation": "t3",
@@ -96,7 +94,7 @@ def flame_from_benchmark(file: Path) -> "tuple[dict[str, np.ndarray], np.ndarray
     return flame, turns, arrays["translation"], scale
 
 
-def _euler_xyz(angles: "np.ndarray") -> "np.ndarray":
+def _euler_xyz(angles: np.ndarray) -> np.ndarray:
     """Rotations Rx Ry Rz [t, 3, 3] of angles about x, y and z in radians."""
     import torch
 
@@ -111,10 +109,8 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
     """Serial numbers, pictures and mattes of a sequence's videos."""
     import itertools
 
-    import numpy as np
-
     from mien.datasets.pictures import collect
-    from mien.media.video import read_video_frames
+    from mien.media.video import count_frames, read_video_frames
 
     videos = _videos(folder, root)
     if not videos:  # a link to itself is no file, and yet a name
@@ -127,7 +123,7 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
         if not is_file_inside(root, matte):
             raise UserError(f"{matte}: is missing, the mattes of {videos[serial].name}; {REMEDY}")
         opened[serial] = (read_video_frames(videos[serial]), read_video_frames(matte))
-    counts = {serial: _count(videos[serial]) for serial in serials}
+    counts = {serial: count_frames(videos[serial]) for serial in serials}
     if len(set(counts.values())) != 1:
         raise UserError(f"{folder}: its videos have {min(counts.values())} to {max(counts.values())} frames; {REMEDY}")
     first = next(opened[serials[0]][0])[1]
@@ -155,18 +151,9 @@ def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
     return OwnSplit() if folder.with_name(f"{folder.name}{TEST_ENDING}").is_dir() else None
 
 
-def _count(video: Path) -> int:
-    from mien.media.video import count_frames
-
-    return count_frames(video)
-
-
 def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    import numpy as np
-
     from mien.datasets.flame_poses import FRONT, camera_of, carried, face_of_flame, in_front, needed_flame
-    from mien.datasets.overlay import check_overlay
-    from mien.datasets.sequences import tracked_sequence
+    from mien.datasets.sequences import sequence_of
 
     folders = [folder for folder in _sequences(path) if (folder / "tracking" / TRACKING).is_file()]
     if not folders:
@@ -181,16 +168,22 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         if len(images) != len(turns):
             raise UserError(f"{file}: has {len(turns)} frames, but the video has {len(images)}; {REMEDY}")
         size = images.shape[3], images.shape[2]
-        known = read_cameras(path / "calibration" / "camera_params.json", size)
-        if serials[0] not in known:
-            raise UserError(f"{path}: its calibration has no camera {serials[0]}; {REMEDY}")
-        viewmat = known[serials[0]].viewmat.double().numpy().copy()
+        known = _known_cameras(path, serials[:1], size)[serials[0]]
+        viewmat = known.viewmat.double().numpy().copy()
         viewmat[:3, 3] /= scale
-        face = carried(face_of_flame(file, model, flame), turns, shifts / scale)
-        face = in_front(face, np.repeat(viewmat[None], len(face), 0))
-        camera = {serials[0]: camera_of(known[serials[0]].K.double().numpy(), FRONT, size)}
-        sequence = tracked_sequence(file, folder.name, images[:, :1], mattes[:, :1], camera, model, face, FPS_MONO)
-        yield replace(check_overlay(file, sequence, VERSION), own_split=_own_split(folder, len(face)))
+        face = in_front(carried(face_of_flame(file, model, flame), turns, shifts / scale), viewmat)
+        camera = {serials[0]: camera_of(known.K.double().numpy(), FRONT, size)}
+        pictures = images[:, :1], mattes[:, :1]
+        sequence = sequence_of(file, folder.name, pictures, camera, FPS_MONO, (model, face), VERSION)
+        yield replace(sequence, own_split=_own_split(folder, len(face)))
+
+
+def _known_cameras(path: Path, serials: list[str], size: tuple[int, int]) -> "dict[str, Camera]":
+    known = read_cameras(path / "calibration" / "camera_params.json", size)
+    unknown = [serial for serial in serials if serial not in known]
+    if unknown:
+        raise UserError(f"{path}: its calibration has no camera {unknown[0]}; {REMEDY}")
+    return {serial: known[serial] for serial in serials}
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
@@ -198,14 +191,9 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
     for folder in _sequences(path):
         serials, images, mattes = _pictures(folder, path)
-        known = read_cameras(path / "calibration" / "camera_params.json", (images.shape[3], images.shape[2]))
-        unknown = [serial for serial in serials if serial not in known]
-        if unknown:
-            raise UserError(f"{path}: its calibration has no camera {unknown[0]}; {REMEDY}")
+        cameras = _known_cameras(path, serials, (images.shape[3], images.shape[2]))
         fps = FPS_VIEWS if len(serials) > 1 else FPS_MONO
-        sequence = filmed_sequence(
-            folder, folder.name, images, mattes, {serial: known[serial] for serial in serials}, fps
-        )
+        sequence = filmed_sequence(folder, folder.name, images, mattes, cameras, fps)
         yield replace(sequence, own_split=_own_split(folder, len(images)))
 
 

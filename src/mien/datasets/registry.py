@@ -22,10 +22,8 @@ from mien.plugins import plugin, warn, with_plugins
 _OWN = (
     GAUSSIAN_AVATARS, VHAP, NERSEMBLE, NERSEMBLE_BENCHMARK, INSTA, IMAVATAR, NERFACE, NERF_BLENDSHAPE, LIVE_LINK_FACE,
 )  # fmt: skip
-_MAX_NAMED, _MAX_FOLDERS = 5, 1000
-"""Most people that a message names, and most folders that are searched for people."""
-_GROUP = "mien.datasets"
-"""Group of entry points of other packages."""
+_MAX_NAMED, _MAX_FOLDERS = 5, 1000  # most people that a message names, and most folders that are searched for people
+_GROUP = "mien.datasets"  # group of entry points of other packages
 
 
 def datasets() -> list[Dataset]:

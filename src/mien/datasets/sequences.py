@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from mien.capture.person.backend import choose_detector, detector_entry
 from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import FilmedSequence, TrackedSequence
+from mien.datasets.overlay import check_overlay
 from mien.disk.limits import camera_fault
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -22,9 +24,6 @@ from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.tracking import Tracking
 
 _LANDMARKS = "mediapipe"
-_CHUNK = 32
-"""Number of timesteps posed at once."""
-_MAX_FPS = 10_000
 
 
 @torch.no_grad()
@@ -54,23 +53,15 @@ def tracked_sequence(
         fps: Frames per second.
     """
     views = tuple(cameras.values())
-    _check_places(path, cameras, face_model, face)
-    _check_fps(path, fps)
+    _check_cameras(path, cameras, fps)
+    check_face_params(face_model, face, str(path), REMEDY)
+    behind = torch.stack([camera.project(face.head_translation)[1] <= 0 for camera in views]).all(0)
+    if behind.any():
+        raise UserError(f"{path}: in frame {int(behind.int().argmax())} the head is behind every camera; {REMEDY}")
     if _LANDMARKS not in face_model.landmarks:
         raise UserError(f"{path}: the face model {face_model.name!r} has no landmarks; add it with `mien face-models`")
-    capture = Capture(
-        name=name,
-        camera_ids=tuple(cameras),
-        fps=fps,
-        timestamps=np.arange(len(mattes)) / fps,
-        images=images,
-        mattes=mattes,
-        landmarks=_landmarks(face_model, face, views),
-        valid=np.ones(mattes.shape[:2], bool),
-        principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
-        source={"file": path.name},
-        calibration=views,
-    )
+    landmarks, valid = _landmarks(face_model, face, views), np.ones(mattes.shape[:2], bool)
+    capture = _capture(path, name, images, mattes, cameras, fps, landmarks, valid, {})
     tracking = Tracking(
         face_model=face_model.name,
         face_model_hash=face_model.content_hash,
@@ -92,40 +83,51 @@ def filmed_sequence(
     fps: float,
     landmarks: Float[np.ndarray, "t c l 2"] | None = None,
 ) -> FilmedSequence:
-    """Return a sequence without a tracking, for `mien track`.
+    """Return a sequence without a tracking, for `mien track`: the arguments are those of `tracked_sequence`.
 
-    Args:
-        path: The file or folder that it was read from.
-        name: Name of the sequence.
-        images: Decoded sRGB pixels. They may be a memory map.
-        mattes: Opacity of the person; 255 is the person.
-        cameras: Each camera by its id, in the order of the axis c, in one world, for pictures of this size.
-        fps: Frames per second.
-        landmarks: The 478 points of mien's detector in pixels, or None to detect them. A face with NaN is not valid.
+    `landmarks` are the 478 points of mien's detector in pixels, or None to detect them. A face with NaN is not valid.
     """
-    _check_cameras(path, cameras)
-    _check_fps(path, fps)
+    _check_cameras(path, cameras, fps)
     found_by = detector_entry(choose_detector()) if landmarks is None else {}
     landmarks = detected_landmarks(images) if landmarks is None else landmarks
     valid = np.asarray(np.isfinite(landmarks).all((2, 3)))
     if not valid.any():
         raise UserError(f"{path}: no face is found in the pictures of {name}; {REMEDY}")
+    marks = np.where(valid[..., None, None], landmarks, np.nan).astype(np.float32)
+    return FilmedSequence(_capture(path, name, images, mattes, cameras, fps, marks, valid, found_by))
+
+
+def _capture(
+    path: Path, name: str, images: np.ndarray, mattes: np.ndarray, cameras: Mapping[str, Camera], fps: float,
+    landmarks: np.ndarray, valid: np.ndarray, found_by: Mapping[str, Any],
+) -> Capture:  # fmt: skip
     views = tuple(cameras.values())
-    return FilmedSequence(
-        Capture(
-            name=name,
-            camera_ids=tuple(cameras),
-            fps=fps,
-            timestamps=np.arange(len(mattes)) / fps,
-            images=images,
-            mattes=mattes,
-            landmarks=np.where(valid[..., None, None], landmarks, np.nan).astype(np.float32),
-            valid=valid,
-            principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
-            source={"file": path.name, **found_by},
-            calibration=views,
-        )
+    return Capture(
+        name=name,
+        camera_ids=tuple(cameras),
+        fps=fps,
+        timestamps=np.arange(len(mattes)) / fps,
+        images=images,
+        mattes=mattes,
+        landmarks=landmarks,
+        valid=valid,
+        principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
+        source={"file": path.name, **found_by},
+        calibration=views,
     )
+
+
+def sequence_of(
+    path: Path, name: str, pictures: tuple[np.ndarray, np.ndarray], cameras: Mapping[str, Camera], fps: float,
+    tracked: tuple[FaceModel, FaceParams] | None, version: str,
+) -> TrackedSequence | FilmedSequence:  # fmt: skip
+    """Return a sequence, tracked if there is a face, after a check that its mesh lies on the person.
+
+    `pictures` are images and mattes, and `version` names the face model that the tracking needs.
+    """
+    if tracked is None:
+        return filmed_sequence(path, name, *pictures, cameras, fps)
+    return check_overlay(path, tracked_sequence(path, name, *pictures, cameras, *tracked, fps), version)
 
 
 def detected_landmarks(images: UInt8[np.ndarray, "t c h w 3"]) -> Float[np.ndarray, "t c l 2"]:
@@ -140,32 +142,19 @@ def detected_landmarks(images: UInt8[np.ndarray, "t c h w 3"]) -> Float[np.ndarr
     return landmarks
 
 
-def _check_fps(path: Path, fps: float) -> None:
-    if not 0 < fps <= _MAX_FPS:
-        raise UserError(f"{path}: has {fps:g} frames per second, not a number above 0 and at most {_MAX_FPS}; {REMEDY}")
-
-
-def _check_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
+def _check_cameras(path: Path, cameras: Mapping[str, Camera], fps: float) -> None:
     for camera_id, camera in cameras.items():
         fault = camera_fault(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
         if fault is not None:
             raise UserError(f"{path}: camera {camera_id!r} is not valid ({fault}); {REMEDY}")
-
-
-def _check_places(path: Path, cameras: Mapping[str, Camera], face_model: FaceModel, face: FaceParams) -> None:
-    """Check cameras and face parameters, and that a camera sees the head at every timestep."""
-    _check_cameras(path, cameras)
-    check_face_params(face_model, face, str(path), REMEDY)
-    depths = torch.stack([camera.project(face.head_translation)[1] for camera in cameras.values()])
-    behind = (depths <= 0).all(0)
-    if behind.any():
-        raise UserError(f"{path}: in frame {int(behind.int().argmax())} the head is behind every camera; {REMEDY}")
+    if not 0 < fps <= 10_000:
+        raise UserError(f"{path}: has {fps:g} frames per second, not a number above 0 and at most 10,000; {REMEDY}")
 
 
 def _landmarks(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[np.ndarray, "t c l 2"]:
     """The face model's landmarks in every picture, in pixels."""
     parts = []
-    for start in range(0, len(face), _CHUNK):
-        points = face_model.landmark_positions(face_model(face[start : start + _CHUNK]), _LANDMARKS)
+    for start in range(0, len(face), 32):  # timesteps posed at once
+        points = face_model.landmark_positions(face_model(face[start : start + 32]), _LANDMARKS)
         parts.append(torch.stack([camera.project(points)[0] for camera in cameras], dim=1))
     return torch.cat(parts).numpy()

@@ -45,10 +45,7 @@ def is_monocular(path: Path) -> bool:
 def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) -> list[Task]:
     """Return the test sequences of a person, in the world of the trained avatar: the training camera looks ahead.
 
-    Args:
-        path: The person's folder.
-        face_model: The avatar's face model.
-        size: Width and height of the pictures that the avatar was trained on.
+    `size` is the width and height of the pictures that the avatar was trained on.
     """
     file = path / "calibration" / "camera_params.json"
     check_file_inside(path, file)
@@ -64,8 +61,7 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
         flame, turns, shifts, scale = flame_from_benchmark(tracking)
         views = {serial: _shrunk(known[serial], scale) for serial in TEST_CAMERAS}
         ahead = views[TRAINING_CAMERA]
-        face = carried(face_of_flame(tracking, model, flame), turns, shifts / scale)
-        face = in_front(face, np.repeat(ahead[None], len(face), 0))
+        face = in_front(carried(face_of_flame(tracking, model, flame), turns, shifts / scale), ahead)
         placed = {serial: view @ np.linalg.inv(ahead) @ FRONT for serial, view in views.items()}
         tasks.append(Task(name, face, _cameras(known, placed), FPS_MONO))
     return tasks
@@ -74,11 +70,7 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
 def view_task(path: Path, sequence: str, face: FaceParams, trained: dict[str, Camera]) -> Task:
     """Return the trained sequence, seen by the hidden cameras.
 
-    Args:
-        path: The person's folder.
-        sequence: Name of the sequence.
-        face: The person at all timesteps, in the world of the trained cameras.
-        trained: The cameras that the avatar was trained with, by their ids.
+    `face` is the person at all timesteps, in the world of the trained cameras.
     """
     file = path / "calibration" / "camera_params.json"
     check_file_inside(path, file)

@@ -6,17 +6,19 @@ has a world of its own, so each becomes a sequence of mien.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, rotation_part, sniff
+import numpy as np
+
+from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, scalars, sniff, stacked_poses
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.disk.inside import is_plain_name
 from mien.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from mien.camera import Camera
     from mien.datasets.dataset import TrackedSequence
     from mien.face.model import FaceModel
     from mien.training.splits.own import OwnSplit
@@ -24,13 +26,10 @@ if TYPE_CHECKING:
 _VERSION = "FLAME 2023 (flame2023.pkl) with GaussianAvatars' teeth"
 _WHOLE, _TRAIN = "transforms.json", "transforms_train.json"
 _PARTS = (_WHOLE, _TRAIN, "transforms_val.json", "transforms_test.json")
-_FPS = 25.0
-"""VHAP stores no frame rate; it resamples videos to this one."""
+_FPS = 25.0  # VHAP stores no frame rate; it resamples videos to this one
 _PARAMETERS = ("translation", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "expr")
-_SHARED = ("shape", "static_offset")
-"""Arrays that are the same in all files of a sequence."""
-_SAME_PLACE = 1e-4
-"""Largest difference of a camera's matrix within a sequence."""
+_SHARED = ("shape", "static_offset")  # arrays that are the same in all files of a sequence
+_SAME_PLACE = 1e-4  # largest difference of a camera's matrix within a sequence
 
 
 @dataclass(frozen=True)
@@ -126,43 +125,30 @@ def _survey(path: Path) -> Findings:
     return Findings(clips, "FLAME 2023 with teeth", split, tuple(missing))
 
 
-def viewmat_from_vhap(pose: "np.ndarray") -> "np.ndarray":
-    """World-to-camera matrix with OpenCV's axes, from a camera-to-world matrix with OpenGL's."""
-    import numpy as np
-
-    return np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
-
-
-def intrinsics_from_vhap(frame: _Frame, from_below: bool) -> "np.ndarray":
+def intrinsics_from_vhap(frame: _Frame, from_below: bool) -> np.ndarray:
     """Intrinsics in pixels. Exports since November 2024 count the principal point's cy from below."""
     from mien.datasets.flame_poses import pinhole
 
-    fx, fy, cx, cy = (float(numbers(frame.file, frame.content, name, ())) for name in ("fl_x", "fl_y", "cx", "cy"))
-    height = float(numbers(frame.file, frame.content, "h", ()))
+    fx, fy, cx, cy, height = scalars(frame.file, frame.content, "fl_x", "fl_y", "cx", "cy", "h")
     return pinhole(fx, fy, cx, height - cy if from_below else cy)
 
 
-def _viewmats(group: _Group) -> "dict[str, np.ndarray]":
-    import numpy as np
+def _viewmats(group: _Group) -> dict[str, np.ndarray]:
+    from mien.datasets.flame_poses import viewmats_from_opengl
 
     matrices = {}
     for camera in group.cameras:
-        poses = []
-        for timestep in group.timesteps:
-            frame = group.frames[timestep, camera]
-            pose = numbers(frame.file, frame.content, "transform_matrix", (4, 4))
-            poses.append(rotation_part(frame.file, "transform_matrix", pose))
+        frames = [group.frames[timestep, camera] for timestep in group.timesteps]
+        poses = [stacked_poses(frame.file, [frame.content], "transform_matrix")[0] for frame in frames]
         if not np.abs(np.stack(poses) - poses[0]).max() < _SAME_PLACE:
             raise UserError(f"{group.name}: the camera {camera} moves, and mien's cameras stand still; {REMEDY}")
-        matrices[camera] = viewmat_from_vhap(poses[0])
+        matrices[camera] = viewmats_from_opengl(poses[0])
     return matrices
 
 
-def _flame_arrays(group: _Group, root: Path) -> "dict[str, np.ndarray]":
+def _flame_arrays(group: _Group, root: Path) -> dict[str, np.ndarray]:
     """The arrays of all timesteps, as in flame_param.npz of GaussianAvatars."""
-    import numpy as np
-
-    from mien.datasets.arrays import read_some_arrays
+    from mien.datasets.content import read_some_arrays
 
     rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_PARAMETERS, "dynamic_offset")}
     shared: dict[str, np.ndarray] = {}
@@ -193,11 +179,8 @@ def _flame_arrays(group: _Group, root: Path) -> "dict[str, np.ndarray]":
     return {**{name: np.concatenate(each) for name, each in rows.items() if each}, **shared}
 
 
-def _pictures(group: _Group, root: Path) -> "tuple[np.ndarray, np.ndarray]":
-    import numpy as np
-
-    from mien.datasets.matting import fill_mattes
-    from mien.datasets.pictures import collect, read_matte, read_picture
+def _pictures(group: _Group, root: Path) -> tuple[np.ndarray, np.ndarray]:
+    from mien.datasets.pictures import collect, fill_mattes, read_matte, read_picture
 
     first = group.frames[group.timesteps[0], group.cameras[0]]
     announced = tuple(int(numbers(first.file, first.content, name, ())) for name in ("w", "h"))
@@ -225,50 +208,61 @@ def _root(path: Path, groups: list[_Group]) -> Path:
     return path if all(group.name == own for group in groups) else path.parent
 
 
-def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    from mien.datasets.flame_poses import FRONT, camera_of, face_of_flame, in_front, needed_flame
+def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of, face_of_flame, in_front
     from mien.datasets.overlay import check_overlay
-    from mien.datasets.sequences import tracked_sequence
+    from mien.datasets.sequences import filmed_sequence, tracked_sequence
 
-    model, groups = needed_flame(path, face_model, _VERSION), _groups(path)
+    groups = _groups(path)
     root = _root(path, groups)
     for group in groups:
-        face = face_of_flame(path, model, _flame_arrays(group, root))
+        face = None if model is None else face_of_flame(path, model, _flame_arrays(group, root))
         images, mattes = _pictures(group, root)
-        size = images.shape[3], images.shape[2]
         viewmats = _viewmats(group)
         if len(viewmats) == 1:
-            import numpy as np
-
             (camera, viewmat) = next(iter(viewmats.items()))
-            face, viewmats = in_front(face, np.repeat(viewmat[None], len(face), 0)), {camera: FRONT}
+            face = None if face is None else in_front(face, viewmat)
+            viewmats = {camera: FRONT}
 
-        def built(
-            from_below: bool, group: _Group = group, viewmats: Any = viewmats, face: Any = face, images: Any = images,
-            mattes: Any = mattes, size: tuple[int, int] = size,
-        ) -> "TrackedSequence":  # fmt: skip
-            cameras = {
-                camera: camera_of(intrinsics_from_vhap(group.frames[group.timesteps[0], camera], from_below),
-                                  viewmats[camera], size)
-                for camera in group.cameras
-            }  # fmt: skip
-            return tracked_sequence(path, group.name, images, mattes, cameras, model, face, _FPS)
+        def cameras(
+            from_below: bool, group: _Group = group, viewmats: Any = viewmats, images: np.ndarray = images
+        ) -> "dict[str, Camera]":
+            first = {camera: group.frames[group.timesteps[0], camera] for camera in group.cameras}
+            size = images.shape[3], images.shape[2]
+            return {
+                camera: camera_of(intrinsics_from_vhap(frame, from_below), viewmats[camera], size)
+                for camera, frame in first.items()
+            }
 
-        sequence = check_overlay(path, _better(built, group), _VERSION)
+        if model is None or face is None:
+            sequence = filmed_sequence(path, group.name, images, mattes, cameras(False), _FPS)
+        else:
+            made = partial(tracked_sequence, path, group.name, images, mattes, face_model=model, face=face, fps=_FPS)
+            sequence = check_overlay(path, _better(made, cameras, group), _VERSION)
         yield replace(sequence, own_split=_own_split(group) if (path / _TRAIN).exists() else None)
 
 
-def _better(built: Any, group: _Group) -> "TrackedSequence":
+def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import needed_flame
+
+    return _sequences(path, needed_flame(path, face_model, _VERSION))
+
+
+def _read_pictures(path: Path) -> Iterator[ReadSequence]:
+    return _sequences(path, None)
+
+
+def _better(made: Any, cameras: Any, group: _Group) -> "TrackedSequence":
     """The sequence with cy counted from above or from below, whichever fits the pictures better."""
     from mien.datasets.overlay import measure_overlay
     from mien.machine.progress import say
 
-    above = built(False)
+    above = made(cameras=cameras(False))
     frames = [group.frames[group.timesteps[0], camera] for camera in group.cameras]
     shifts = [abs(float(frame.content["h"]) - 2 * float(frame.content["cy"])) for frame in frames]
     if max(shifts) < 1:
         return above
-    below = built(True)
+    below = made(cameras=cameras(True))
     fits = [measure_overlay(sequence) for sequence in (above, below)]
     distances = [fit.distance for fit in fits]
     if distances[0] is not None and distances[1] is not None:
@@ -277,25 +271,6 @@ def _better(built: Any, group: _Group) -> "TrackedSequence":
         is_below = fits[1].agreement > fits[0].agreement
     say(f"{group.name}: cy is counted from {'below' if is_below else 'above'}, which fits the pictures better")
     return below if is_below else above
-
-
-def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    from mien.datasets.flame_poses import FRONT, camera_of
-    from mien.datasets.sequences import filmed_sequence
-
-    groups = _groups(path)
-    root = _root(path, groups)
-    for group in groups:
-        images, mattes = _pictures(group, root)
-        size = images.shape[3], images.shape[2]
-        viewmats = _viewmats(group)
-        viewmats = viewmats if len(viewmats) > 1 else dict.fromkeys(viewmats, FRONT)
-        cameras = {
-            camera: camera_of(intrinsics_from_vhap(group.frames[group.timesteps[0], camera], False), viewmat, size)
-            for camera, viewmat in viewmats.items()
-        }
-        sequence = filmed_sequence(path, group.name, images, mattes, cameras, _FPS)
-        yield replace(sequence, own_split=_own_split(group) if (path / _TRAIN).exists() else None)
 
 
 VHAP = Dataset(

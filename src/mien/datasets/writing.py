@@ -32,11 +32,7 @@ def write_sequence(folder: Path, sequence: TrackedSequence | FilmedSequence, dat
 
     The folder appears as a whole, after its files were read back.
 
-    Args:
-        folder: The sequence's folder, which is missing.
-        sequence: The sequence.
-        dataset: The dataset that it comes from.
-        source: The place that it was read from.
+    `source` is the place that it was read from.
     """
     aside = folder.with_name(f".{folder.name}.partial")
     partial = aside / folder.name  # one level deeper than sequences, so that a killed import leaves none

@@ -1,15 +1,21 @@
-"""Baselines that an avatar has to beat: the mean training picture, and the tracked mesh with the person's colours."""
+"""What an evaluation takes from training pictures: baselines that an avatar has to beat, and its figures on them.
 
+The baselines are the mean training picture, and the tracked mesh with the person's colours.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.evaluation.experiment import Experiment
-from mien.evaluation.trained_frames import TrainedFrames, look_at_trained
+from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.metrics import psnr
+from mien.evaluation.scoring import as_8_bit
+from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import render_mesh
-from mien.training.footage.frames import Frame
+from mien.training.footage.frames import Frame, spread_frames
 from mien.training.footage.mesh_colors import vertex_colors
 
 
@@ -53,15 +59,49 @@ class Baselines:
 
 @torch.no_grad()
 def make_baselines(
-    experiment: Experiment, threads: int | None = None, trained: TrainedFrames | None = None
+    experiment: Experiment, threads: int | None = None, means: dict[Frame, Tensor] | None = None
 ) -> Baselines:
-    """Both baselines, from training frames only.
-
-    Args:
-        experiment: The experiment.
-        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no figure.
-        trained: The means of the training frames, if they are known.
-    """
+    """Both baselines, from training frames only. `means` are those of `look_at_trained`, if they are known."""
     model, frames = experiment.avatar.face_model, experiment.training_frames
     colors = vertex_colors(model, experiment.sequences, experiment.faces, frames, threads)
-    return Baselines((trained or look_at_trained(experiment, 0, threads)).means, colors)
+    return Baselines(look_at_trained(experiment, 0, threads)[0] if means is None else means, colors)
+
+
+@torch.no_grad()
+def look_at_trained(
+    experiment: Experiment, scored: int, threads: int | None = None, *, mean: bool = True
+) -> tuple[dict[Frame, Float[Tensor, "h w 3"]], dict[Frame, tuple[float, float]]]:
+    """The mean target of each sequence and camera (at timestep 0), and PSNR on frame and head crop of some frames.
+
+    The avatar is scored on at most `scored` evenly spread frames, and all are read for the `mean` target. `threads`
+    change no figure.
+    """
+    every = experiment.training_frames
+    judged = spread_frames(every, scored) if scored else []
+    chosen = set(judged)
+
+    def jobs() -> Iterator[tuple[Frame, Tensor | None]]:
+        # Rendering runs here, frame by frame; all else runs in threads.
+        for frame in every if mean else judged:
+            yield frame, avatar_image(experiment, frame) if frame in chosen else None
+
+    def look(job: tuple[Frame, Tensor | None]) -> tuple[Frame, Tensor, tuple[float, float] | None]:
+        frame, drawn = job
+        target = target_image(experiment, frame)
+        if drawn is None:
+            return frame, target, None
+        image = as_8_bit(drawn)
+        return frame, target, (psnr(image, target), psnr(image, target, experiment.crop(frame)))
+
+    sums: dict[Frame, Tensor] = {}
+    counts: dict[Frame, int] = {}
+    figures: dict[Frame, tuple[float, float]] = {}
+    # Sums are taken here, in the order of the frames.
+    for frame, target, found in stream_in_threads(look, jobs(), threads):
+        if found is not None:
+            figures[frame] = found
+        if mean:
+            key = frame._replace(timestep=0)
+            sums[key] = sums[key].add_(target) if key in sums else target
+            counts[key] = counts.get(key, 0) + 1
+    return {key: total / counts[key] for key, total in sums.items()}, figures

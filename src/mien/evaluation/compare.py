@@ -5,16 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mien.disk.files import expect_whole
 from mien.errors import UserError
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
     FACE_SOURCE_NAMES,
     FITTED_NAME,
     OVER_DARK_NAME,
+    REMEDY,
     figure,
-    read_figures,
+    read_metrics,
 )
-from mien.pages.metric_names import COLUMNS
+from mien.pages.pages import COLUMNS
 from mien.training.run import read_run_config
 
 
@@ -85,9 +87,7 @@ class Comparison:
             "version": 1,
             "tables": [
                 {
-                    "protocol": table.protocol,
-                    "split": table.split,
-                    "frames": table.frames,
+                    **{name: getattr(table, name) for name in ("protocol", "split", "frames")},
                     "scored_on": dict(table.scored_on),
                     "edges": table.edges,
                     "rows": [_row_content(row) for row in table.rows],
@@ -106,7 +106,10 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
             warnings.append(f"{label}: was not evaluated; run `mien evaluate` on it")
             continue
         method = read_run_config(run_dir)["method"]["kind"]
-        runs.append(ScoredRun(label, run_dir, method, read_figures(run_dir)))
+        run = ScoredRun(label, run_dir, method, read_metrics(run_dir))
+        with expect_whole(run_dir / "metrics.json", REMEDY):
+            Comparison((run,), tuple(_tables([run])[0]), ()).content()  # stumbles where the name of the file is known
+        runs.append(run)
     if not runs:
         listed = ", ".join(run_dirs) or "there is none"
         raise UserError(f"no evaluated run to compare ({listed}); run `mien evaluate DIR --run NAME` first")
@@ -179,27 +182,19 @@ def _differences(table: Table) -> list[str]:
 
 
 def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
-    rows: list[Row] = []
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
-        rows.append(Row(run.label, entry, run, FACE_SOURCE_NAMES[entry["face_params"]]))
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
-        if entry["face_params"] != "as_tracked":
-            rows.append(Row(run.label, entry["as_tracked"], None, FACE_SOURCE_NAMES["as_tracked"]))
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
-        if "fitted" in entry:
-            rows.append(Row(run.label, entry["fitted"], None, FITTED_NAME))
-    first = runs[0].metrics["protocols"][protocol]
+    entries = [(run, run.metrics["protocols"][protocol]) for run in runs]
+    first, names = entries[0][1], FACE_SOURCE_NAMES
+    rows = [Row(run.label, entry, run, names[entry["face_params"]]) for run, entry in entries]
+    corrected = [(run, entry) for run, entry in entries if entry["face_params"] != "as_tracked"]
+    rows += [Row(run.label, entry["as_tracked"], None, names["as_tracked"]) for run, entry in corrected]
+    rows += [Row(run.label, entry["fitted"], None, FITTED_NAME) for run, entry in entries if "fitted" in entry]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
     # Last, as they are not on the scale of the rows above.
-    for run in runs:
-        entry = run.metrics["protocols"][protocol]
+    for run, entry in entries:
         if "over_dark" in entry:
             label = f"{run.label}, {OVER_DARK_NAME}"
-            rows.append(Row(label, entry["over_dark"], None, FACE_SOURCE_NAMES[entry["face_params"]]))
+            rows.append(Row(label, entry["over_dark"], None, names[entry["face_params"]]))
     return Table(protocol, first["split"], first["frames"], first["scored_on"], first["edges"], tuple(rows))
 
 

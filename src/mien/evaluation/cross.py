@@ -108,11 +108,8 @@ def cross_reenactment(
     Figures are means over drivers; `mien.evaluation.redetection` describes them. They say how much of the motion
     arrives, not how good pictures look. The avatar's own sequence as a driver shows the best that can be expected.
 
-    Args:
-        run_dir: A finished run.
-        sequence_dir: A sequence that the run was trained on. Its camera sees the avatar.
-        driver_dirs: Folders of tracked sequences.
-        video_frames: Largest number of frames per video, or 0 for no videos.
+    `sequence_dir` is a sequence that the run was trained on: its camera sees the avatar. `video_frames` is the largest
+    number of frames per video, or 0 for no videos.
     """
     entries, videos = [], []
     for folder in driver_dirs:

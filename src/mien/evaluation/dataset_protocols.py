@@ -67,11 +67,7 @@ def check_lpips(protocol: DatasetProtocol, settings: ScoreSettings) -> None:
 def scores_whole_mattes(protocol: DatasetProtocol, run_dir: Path, folders: Mapping[Path, Scoring], split: str) -> bool:
     """Check that a protocol fits a run, and return whether it scores whole mattes instead of mien's scoring masks.
 
-    Args:
-        protocol: The protocol.
-        run_dir: The run, for messages.
-        folders: The folders of the run's sequences, with their scoring masks.
-        split: The split of the run.
+    `folders` are those of the run's sequences, with their scoring masks.
     """
     found = {folder: imported_from(folder) for folder in folders}
     for folder, dataset in found.items():

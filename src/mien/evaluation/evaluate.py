@@ -18,11 +18,11 @@ from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, living, write_film
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
+from mien.evaluation.page_parts import Video, video_of
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
-from mien.evaluation.report.page import ReportVideo
-from mien.evaluation.report.report_sections import cross_section
-from mien.evaluation.report.writing import RunRecord, write_report
+from mien.evaluation.report_sections import cross_section
+from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.perceptual.lpips import load_lpips
@@ -30,8 +30,7 @@ from mien.training.footage.filmed import read_coverage
 from mien.training.frame_gains import GAINS
 from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
-_RECIPE = 4
-"""Version of the scoring. It is raised whenever the same frame would get other figures."""
+_RECIPE = 4  # version of the scoring. It is raised whenever the same frame would get other figures
 
 
 def evaluate(
@@ -50,10 +49,6 @@ def evaluate(
 
     Returns:
         The content of metrics.json: `protocols` and `training`.
-
-    Raises:
-        UserError: the run is not finished, the sequences are not those of the run, nothing was held out, or another
-            process is writing the run.
     """
     check_tree(run_dir)
     check_ranges(settings or EvaluationSettings(), lambda name: f"--{name.replace('_', '-')}")
@@ -88,11 +83,7 @@ def _evaluate(
         driven = {"cross_reenactment": entry}
     fingerprints = {name: partial.fingerprint for name, partial in partials.items()}
     content = {"protocols": {**protocols, **driven}, "training": summary, "fingerprints": fingerprints}
-    videos = {
-        name: _video(run_dir, name, experiment, evaluation, settings)
-        for name, (experiment, evaluation) in results.items()
-        if settings.video_frames
-    }
+    videos = {name: _video(run_dir, name, *results[name], settings) for name in results if settings.video_frames}
     for name, experiment in experiments.items():
         if settings.pictures:
             write_scored_pictures(run_dir / "pictures" / name, experiment)
@@ -127,12 +118,12 @@ def is_evaluated(run_dir: Path, sequence_dirs: Items[Path], settings: Evaluation
 
 def _video(
     run_dir: Path, name: str, experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings
-) -> ReportVideo:
+) -> Video:
     path = run_dir / "videos" / f"{name}.mp4"
-    count = write_comparison_video(
-        path, experiment, evaluation, settings.video_frames, worker_threads(settings.threads)
-    )
-    return ReportVideo(path, count, len(evaluation.frames))
+    threads = worker_threads(settings.threads)
+    count = write_comparison_video(path, experiment, evaluation, settings.video_frames, threads)
+    part = "" if count == len(evaluation.frames) else f", {count} of {len(evaluation.frames)} frames"
+    return video_of(path, run_dir, f"Truth, rendering, error{part}")
 
 
 def _fingerprint(run_dir: Path, protocol: str, experiment: Experiment, settings: EvaluationSettings) -> str:

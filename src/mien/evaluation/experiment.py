@@ -146,11 +146,7 @@ def avatar_image(
 ) -> Float[Tensor, "h w 3"]:
     """The avatar posed and seen as in a frame, over a colour, clamped to 0..1.
 
-    Args:
-        experiment: The experiment.
-        frame: The frame.
-        face: Face parameters that pose the avatar instead of the experiment's.
-        background: The colour, 0 to 255.
+    `face` poses the avatar instead of the experiment's face parameters.
     """
     return drawn_image(experiment, frame, posed_avatar(experiment, frame, face), background)
 

@@ -29,9 +29,7 @@ class FittedFaces:
     A timestep starts from the face parameters of the headline. All of its held-out cameras are fitted together, since
     they show the same face. Nothing in the experiment changes, and results do not depend on the order of questions.
 
-    Args:
-        experiment: The experiment.
-        steps: Number of optimiser steps for each timestep, at least 1.
+    Each timestep takes `steps` optimiser steps, at least 1.
     """
 
     def __init__(self, experiment: Experiment, steps: int):
@@ -56,10 +54,7 @@ def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FacePar
     The loss is the mean absolute difference of colours, summed over the frames. Expression coefficients stay within the
     bounds of the face model, or where the tracking left them.
 
-    Args:
-        experiment: The experiment.
-        frames: Frames of one timestep, from different cameras.
-        steps: Number of optimiser steps.
+    `frames` are those of one timestep, from different cameras.
     """
     avatar = experiment.avatar
     targets = [(frame, target_image(experiment, frame)) for frame in frames]

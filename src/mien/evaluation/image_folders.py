@@ -1,18 +1,20 @@
 """Scores for pictures of any program, by the code that scores avatars. Folders match by name, videos by order."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from mien.disk.files import read_json, write_json
+from mien.disk.inside import listed
 from mien.errors import UserError
-from mien.evaluation.image_source import PictureSource, open_pictures
 from mien.evaluation.scoring import (
     PIXELS,
     SSIM_WINDOW,
@@ -26,19 +28,84 @@ from mien.evaluation.scoring import (
 )
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar, say
+from mien.media.decoding import decode_picture
 from mien.media.pictures import Box
+from mien.media.video import read_video_frames
 from mien.tracking.scoring import head_crop
 from mien.training.footage.frames import evenly_spread
 from mien.training.footage.sequence import composite
 
-SCORES_FORMAT, SCORES_VERSION = "mien.scores", 1
-CROPS_FORMAT, CROPS_VERSION = "mien.crops", 1
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 CROPS_NAME = "crops.json"
 Background = Literal["white", "black"]
 _COLORS = {"white": 255, "black": 0}
-_MAX_NAMED = 3
-_MAX_COORDINATE = 1_000_000
-"""Largest coordinate or size of a head box, in pixels."""
+
+
+@dataclass(frozen=True)
+class PictureSource:
+    """A folder of pictures, or a video."""
+
+    path: Path
+    count: int
+    names: list[str] | None
+    """File names without their endings, in order. None for a video."""
+    files: dict[str, Path]
+    """Files by name. Empty for a video."""
+
+    def read(self, names: Sequence[str]) -> Iterator[UInt8[np.ndarray, "h w _"]]:
+        """Yield the pictures of these names, with 3 or 4 channels. A video's pictures come in order."""
+        if self.names is None:
+            yield from itertools.islice((picture for _, picture in read_video_frames(self.path)), len(names))
+            return
+        in_order = len(names) == self.count and any(name not in self.files for name in names)
+        for name in self.names if in_order else names:
+            yield read_picture(self.files[name])
+
+
+def open_pictures(path: Path) -> PictureSource:
+    """Open the pictures at a path."""
+    if path.is_file():
+        count = sum(1 for _ in read_video_frames(path))
+        say(f"warning: {path}: video compression changes pixels; png pictures give more accurate figures")
+        return PictureSource(path, count, None, {})
+    if not path.is_dir():
+        raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
+    files: dict[str, Path] = {}
+    for file in listed(path):
+        if file.suffix.lower() not in _ENDINGS:
+            continue
+        if file.stem in files:
+            raise UserError(
+                f"{path}: contains both {files[file.stem].name} and {file.name}; keep one picture of each name"
+            )
+        files[file.stem] = file
+    if not files:
+        raise UserError(f"{path}: contains no picture; give files that end in {', '.join(_ENDINGS)}")
+    return PictureSource(path, len(files), list(files), files)
+
+
+def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
+    """A picture of 8 bits per channel as RGB or RGBA. Grey becomes RGB."""
+    try:
+        # libpng would return the upper half of a truncated file.
+        cut = path.suffix.lower() == ".png" and _end_of(path) != b"IEND\xaeB`\x82"
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    picture = None if cut else decode_picture(path, cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise UserError(f"{path}: is not a complete picture; write it again")
+    if picture.dtype != np.uint8:
+        raise UserError(f"{path}: has {picture.dtype} values; convert it to 8 bits a channel")
+    if picture.ndim == 2:
+        return np.repeat(picture[..., None], 3, axis=2)
+    order = [2, 1, 0, 3][: picture.shape[2]]
+    return np.ascontiguousarray(picture[..., order])
+
+
+def _end_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 8))
+        return file.read(8)
 
 
 @dataclass(frozen=True)
@@ -58,10 +125,7 @@ class ImageFolders:
     """Colour behind pictures with an alpha channel, and behind the truth outside the mattes."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """One picture and its truth."""
-
+class _Pair(NamedTuple):
     name: str
     image: UInt8[np.ndarray, "h w 3"]
     truth: UInt8[np.ndarray, "h w 3"]
@@ -107,31 +171,28 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
 
 def write_scores(path: Path, scores: dict[str, Any]) -> None:
     """Write the result of `score_folders`."""
-    write_json(path, SCORES_FORMAT, SCORES_VERSION, scores)
+    write_json(path, "mien.scores", 1, scores)
 
 
 def write_crops(path: Path, crops: dict[str, Box]) -> None:
     """Write the head boxes (left, top, width, height) of named pictures."""
-    write_json(path, CROPS_FORMAT, CROPS_VERSION, {"crops": {name: list(box) for name, box in crops.items()}})
+    write_json(path, "mien.crops", 1, {"crops": {name: list(box) for name, box in crops.items()}})
 
 
 def read_crops(path: Path) -> dict[str, Box]:
     """Read what `write_crops` wrote."""
     try:
-        crops = read_json(path, CROPS_FORMAT, CROPS_VERSION).get("crops")
+        crops = read_json(path, "mien.crops", 1).get("crops")
     except UserError as error:
         # The file is beside the user's own pictures, so there is no folder to delete and no stage to run.
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
     for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
-        if not isinstance(box, list) or len(box) != 4 or not all(map(_is_coordinate, box)) or min(box[2:]) < 1:
+        whole = isinstance(box, list) and all(type(each) is int and abs(each) <= 1_000_000 for each in box)
+        if not whole or len(box) != 4 or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")
         boxes[name] = (box[0], box[1], box[2], box[3])
     return boxes
-
-
-def _is_coordinate(value: Any) -> bool:
-    return type(value) is int and abs(value) <= _MAX_COORDINATE
 
 
 class _Pairs:
@@ -212,7 +273,7 @@ def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_MAX_NAMED]) + (", ..." if len(names) > _MAX_NAMED else "")
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def _floats(image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -27,16 +27,12 @@ SECONDS, FPS, SIDE = 5.0, 25, 512
 """Length in seconds, frames per second, and sides in pixels of the film."""
 MOST_YAW, LEAST_YAW, _MOST_PITCH = 0.4, 0.1, 0.08
 """Largest turns of the head to a side, turns that every head makes, and largest nods, in radians."""
-_MARGIN = 0.06
-"""Width of the free space around the head, as a share of the picture."""
+_MARGIN = 0.06  # width of the free space around the head, as a share of the picture
 _FACES = (("smile", 0.9, 1.3, 1.0), ("surprise", 2.6, 0.9, 0.8), ("smile", 3.9, 1.0, 0.6))
 """What the face does: a preset, when it begins and how long it lasts in seconds, and how strong it is."""
-_BLINKS = (0.45, 2.35, 3.75)
-"""When the eyes are closed, in seconds."""
-_BLINK = 0.12
-"""Time in which they close, and in which they open, in seconds."""
-_STRIP = 6
-"""Number of faces in the strip."""
+_BLINKS = (0.45, 2.35, 3.75)  # when the eyes are closed, in seconds
+_BLINK = 0.12  # time in which they close, and in which they open, in seconds
+_STRIP = 6  # number of faces in the strip
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,14 @@ def load_experiments(
         if _digests(folder) != digest:
             raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
-    clothes = _clothes(sequence_dirs, sequences) if rules is not None and rules.opened else ()
+    clothes: tuple[UInt8[np.ndarray, "t h p"] | None, ...] = ()
+    if rules is not None and rules.opened:
+        shapes = (sequence.capture.mattes.shape for sequence in sequences)
+        sized = zip(sequence_dirs, shapes, strict=True)
+        clothes = tuple(read_clothes(folder, (t, height, width)) for folder, (t, _, height, width) in sized)
+    scored = [{**each, **({"mask": "matte"} if whole else {})} for each in digests]
+    for each, packed in zip(scored, clothes, strict=False):
+        each |= {} if packed is None else {"clothes": clothes_digest(packed)}
     avatar = load_avatar(run_dir)
     for folder, sequence in zip(sequence_dirs, sequences, strict=True):
         check_face_params(avatar.face_model, sequence.tracking.face, str(folder), "track it again")
@@ -72,7 +79,7 @@ def load_experiments(
         whole_mattes=whole,
         clothes=clothes,
         gains=tuple(read_gains(run_dir, [sequence.capture.timesteps for sequence in sequences])),
-        digests=_scored_digests(digests, whole, clothes),
+        digests=tuple(scored),
     )
     found = held_out_by_protocol(sequences, settings)
     if rules is not None:
@@ -81,25 +88,6 @@ def load_experiments(
         name: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
         for name, (split, frames) in found.items()
     }
-
-
-def _scored_digests(
-    digests: Items[dict[str, str]], whole: bool, clothes: Items[UInt8[np.ndarray, "t h p"] | None]
-) -> tuple[dict[str, str], ...]:
-    """The hashes of what is scored: pictures, mask or whole matte, and clothes where a protocol asks for them."""
-    found = []
-    for each, packed in zip(digests, clothes or (None,) * len(digests), strict=True):
-        matte = {"mask": "matte"} if whole else {}
-        found.append({**each, **matte, **({} if packed is None else {"clothes": clothes_digest(packed)})})
-    return tuple(found)
-
-
-def _clothes(folders: Items[Path], sequences: Items[Sequence]) -> tuple[UInt8[np.ndarray, "t h p"] | None, ...]:
-    """The packed masks of clothes of each sequence."""
-    shapes = (sequence.capture.mattes.shape for sequence in sequences)
-    return tuple(
-        read_clothes(folder, (t, height, width)) for folder, (t, _, height, width) in zip(folders, shapes, strict=True)
-    )
 
 
 def _digests(folder: Path) -> dict[str, str]:

@@ -24,8 +24,7 @@ def crop_to(image: Shaped[Tensor, "h w *c"], box: Box | None) -> Shaped[Tensor, 
         return image
     left, top, width, height = box
     cut = image[max(top, 0) : max(top + height, 0), max(left, 0) : max(left + width, 0)]
-    assert cut.shape[0] > 0, f"box {box} does not meet the {image.shape[1]}x{image.shape[0]} image"
-    assert cut.shape[1] > 0, f"box {box} does not meet the {image.shape[1]}x{image.shape[0]} image"
+    assert min(cut.shape[:2]) > 0, f"box {box} does not meet the {image.shape[1]}x{image.shape[0]} image"
     return cut
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.disk.config import Range
-from mien.evaluation.baselines import Baselines, make_baselines
+from mien.evaluation.baselines import Baselines, look_at_trained, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import (
     DARK,
@@ -42,7 +42,6 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
-from mien.evaluation.trained_frames import look_at_trained
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
@@ -128,11 +127,7 @@ def evaluate_frames(
 ) -> Evaluation:
     """Score every held-out frame. Rendering runs here, frame by frame; scoring runs in threads.
 
-    Args:
-        experiment: The experiment to score.
-        settings: What to compute.
-        partial: Figures that an interrupted evaluation has computed. New ones are added.
-        title: Title of the progress bar.
+    `partial` has the figures that an interrupted evaluation has computed, and takes new ones.
     """
     assert experiment.held_out_frames, "nothing is held out"
     frames = experiment.held_out_frames
@@ -146,8 +141,8 @@ def evaluate_frames(
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
     perceptual_frames = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
-    trained = look_at_trained(experiment, _MAX_TRAINING_FRAMES, threads, mean=settings.baselines)
-    baselines = make_baselines(experiment, threads, trained) if settings.baselines else None
+    means, training_psnr = look_at_trained(experiment, _MAX_TRAINING_FRAMES, threads, mean=settings.baselines)
+    baselines = make_baselines(experiment, threads, means) if settings.baselines else None
     fitted = FittedFaces(experiment, settings.fit_steps) if settings.fit_faces else None
 
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
@@ -179,7 +174,7 @@ def evaluate_frames(
     # Sequences without masks of clothes have no figures without clothes.
     scores = {subject: tuple(row[subject] for row in rows if subject in row) for subject in _figure_names(rows)}
     seconds = sorted(done[frame][1] for frame in frames)
-    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, trained.psnr)
+    return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, training_psnr)
 
 
 def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
@@ -234,24 +229,29 @@ def _as_tracked(experiment: Experiment) -> Experiment:
     return replace(experiment, faces=tuple(tracked))
 
 
-def _mask_words(experiment: Experiment, frames: Sequence[Frame]) -> str:
-    """What the mask of some frames is."""
-    if experiment.whole_mattes:
-        return _MATTES
-    return "; ".join(sorted({_MASKS[experiment.scorings[frame.sequence].cut] for frame in frames}))
-
-
 def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: EvaluationSettings) -> dict[str, Any]:
     """The protocol's entry of metrics.json: means over frames, how they were computed, and every frame's figures."""
-    scores = evaluation.scores
+    scores, frames = evaluation.scores, evaluation.frames
     own_rows = scores[AVATAR]
+    cuts = sorted({_MASKS[experiment.scorings[frame.sequence].cut] for frame in frames})
+    clear = [sequence.clear() for sequence in experiment.sequences]
+    covered = sum(not clear[frame.sequence][frame.timestep, frame.camera] for frame in frames)
+    trained, trained_head = zip(*evaluation.training_psnr.values(), strict=True)
+    further: dict[str, Any] = {name: mean_scores(scores[name]) for name in (OVER_DARK, FITTED) if name in scores}
+    if OVER_DARK in further:
+        further[OVER_DARK]["color"] = list(DARK)
+    if FITTED in further:
+        further[FITTED]["fit"] = {"steps": settings.fit_steps, "loss": LOSS}
+    for name in (OPENED, UNCLOTHED):
+        if name in scores:
+            further[name] = {**mean_scores(scores[name]), "frames": len(scores[name])}
     return {
         **mean_scores(own_rows),
         "perceptual_backbone": settings.backbone if settings.perceptual else None,
         "perceptual_frames": sum("perceptual" in row for row in own_rows),
         **({} if settings.lpips_weights is None else {"lpips_backbone": load_lpips(settings.lpips_weights).backbone}),
         "split": experiment.split,
-        "mask": _mask_words(experiment, evaluation.frames),
+        "mask": _MATTES if experiment.whole_mattes else "; ".join(cuts),
         **({} if settings.protocol is None else {"dataset_protocol": settings.protocol}),
         "edges": experiment.edges,
         "crop": _CROP,
@@ -259,55 +259,28 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
         "ssim_window": SSIM_WINDOWS[settings.border],
         "pixels": PIXELS,
         "face_params": experiment.face_source,
-        "frames": len(evaluation.frames),
-        **_covered_content(experiment, evaluation.frames),
-        "sequences": sorted({experiment.sequences[frame.sequence].name for frame in evaluation.frames}),
-        "camera_ids": sorted({experiment.camera_id(frame) for frame in evaluation.frames}),
-        "scored_on": scored_on(experiment, evaluation.frames),
+        "frames": len(frames),
+        **({"covered_frames": covered} if covered else {}),
+        "sequences": sorted({experiment.sequences[frame.sequence].name for frame in frames}),
+        "camera_ids": sorted({experiment.camera_id(frame) for frame in frames}),
+        "scored_on": scored_on(experiment, frames),
         "seconds_per_frame": evaluation.seconds_per_frame,
-        "training_frames": _training_means(evaluation),
+        "training_frames": {"psnr": fmean(trained), "head": {"psnr": fmean(trained_head)}, "frames": len(trained)},
         "baselines": {name: mean_scores(scores[name]) for name in (MEAN_FRAME, MESH) if name in scores},
         "as_tracked": mean_scores(scores.get(AS_TRACKED, own_rows)),
-        **({OVER_DARK: {**mean_scores(scores[OVER_DARK]), "color": list(DARK)}} if OVER_DARK in scores else {}),
-        **_fitted_content(scores, settings),
-        **{
-            name: {**mean_scores(scores[name]), "frames": len(scores[name])}
-            for name in (OPENED, UNCLOTHED)
-            if name in scores
-        },
+        **further,
         "per_frame": {
-            "sequence": [experiment.sequences[frame.sequence].name for frame in evaluation.frames],
-            "timestep": [frame.timestep for frame in evaluation.frames],
-            "camera_id": [experiment.camera_id(frame) for frame in evaluation.frames],
-            **{name: [_rounded(row.get(name)) for row in own_rows] for name in _figure_names(own_rows)},
+            "sequence": [experiment.sequences[frame.sequence].name for frame in frames],
+            "timestep": [frame.timestep for frame in frames],
+            "camera_id": [experiment.camera_id(frame) for frame in frames],
+            **{
+                name: [round(row[name], 5) if name in row else None for row in own_rows]
+                for name in _figure_names(own_rows)
+            },
         },
     }
-
-
-def _covered_content(experiment: Experiment, frames: Sequence[Frame]) -> dict[str, int]:
-    """How many of the frames have a part of the face covered, such as by a hand; nothing if none has."""
-    clear = [sequence.clear() for sequence in experiment.sequences]
-    covered = sum(not clear[frame.sequence][frame.timestep, frame.camera] for frame in frames)
-    return {"covered_frames": covered} if covered else {}
-
-
-def _fitted_content(scores: Mapping[str, Sequence[Scores]], settings: EvaluationSettings) -> dict[str, Any]:
-    """The figures with fitted faces and how they were fitted, or nothing if they were not asked for."""
-    if FITTED not in scores:
-        return {}
-    return {FITTED: {**mean_scores(scores[FITTED]), "fit": {"steps": settings.fit_steps, "loss": LOSS}}}
 
 
 def _figure_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The names of all figures that any frame has. A frame in which the eyes are not seen has no figures of them."""
     return list(dict.fromkeys(name for row in rows for name in row))
-
-
-def _training_means(evaluation: Evaluation) -> dict[str, Any]:
-    """The avatar's mean PSNR on training frames. Its gap to the protocol's figures measures generalisation."""
-    whole, head = zip(*evaluation.training_psnr.values(), strict=True)
-    return {"psnr": fmean(whole), "head": {"psnr": fmean(head)}, "frames": len(whole)}
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 5)

@@ -18,7 +18,7 @@ from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
 from mien.face.parts import PARTS
 from mien.machine.threads import asked_threads
 from mien.media.pictures import Box, to_uint8
-from mien.pages.metric_names import METRICS
+from mien.pages.pages import METRICS
 from mien.perceptual.distance import MIN_SIDE, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips
 from mien.perceptual.weights import Backbone

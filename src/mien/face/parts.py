@@ -28,10 +28,7 @@ def part_boxes(face_model: FaceModel, vertices: Float[Tensor, "v 3"], camera: Ca
     A part is missing if it faces away from the camera, if less than half of its box is inside the picture, if it is
     smaller than 8 pixels, or if the face model has none of its regions.
 
-    Args:
-        face_model: The face model, on the CPU.
-        vertices: Its vertices in world space, in metres.
-        camera: The camera that sees them.
+    The face model is on the CPU, and its vertices are in world space, in metres.
     """
     margins: dict[str, float] = {"eyes": _EYES_MARGIN, "mouth": _MOUTH_MARGIN}
     found: dict[str, Box] = {}

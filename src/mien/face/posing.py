@@ -1,6 +1,5 @@
 """Native computation of vertices and head poses: autograd around the C++ core, for float32 on a CPU."""
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -17,8 +16,7 @@ if TYPE_CHECKING:
     from mien.face.model import FaceModel
 
 
-_MAX_SHAPES = 256
-"""Largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h."""
+_MAX_SHAPES = 256  # largest number of expressions plus nine per free joint: kMostFaceShapes of native/face.h
 
 
 def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
@@ -79,29 +77,20 @@ class CompiledModel:
             parents=model.joint_parents,
             is_free=model.joint_free,
         )
-        self._last: _Person | None = None
+        self._last: tuple[Any, ...] | None = None
 
     def rest_shape(self, model: "FaceModel", face: FaceParams) -> tuple[Tensor, Tensor]:
         """Return vertices and joints of this person without expression."""
         identity, offsets = face.identity, face.vertex_offsets
         versions = (identity._version, None if offsets is None else offsets._version)
-        last = self._last
         # The stored tensors stay alive, so the same object with the same version is the same person.
-        if last and last.identity is identity and last.offsets is offsets and last.versions == versions:
-            return last.shape
+        if self._last and self._last[0] is identity and self._last[1] is offsets and self._last[2] == versions:
+            return self._last[3]
         shape = model.rest_vertices(face), model.rest_joints(face)
         # A stored shape has to serve gradients too, although it may have been computed without them.
         if not (identity.requires_grad or (offsets is not None and offsets.requires_grad)):
-            self._last = _Person(identity, offsets, versions, shape)
+            self._last = identity, offsets, versions, shape
         return shape
-
-
-@dataclass(frozen=True, eq=False)
-class _Person:
-    identity: Tensor
-    offsets: Tensor | None
-    versions: tuple[int, int | None]
-    shape: tuple[Tensor, Tensor]
 
 
 def compiled_model(model: "FaceModel") -> CompiledModel:

@@ -1,1 +1,1 @@
-"""Pages: `pages` fills the templates, `plots` draws their charts, `metric_names` names the figures."""
+"""Pages: `pages` fills the templates and names the figures, `plots` draws charts."""

@@ -1,4 +1,6 @@
-"""HTML from templates. Each room keeps its own in a folder `templates/`; `mien/templates` has what all pages share.
+"""HTML from templates, and names of the figures in tables.
+
+Each room keeps its templates in a folder `templates/`; `mien/templates` has what all pages share.
 
 A page is one file that can be sent around. It needs no network and no scripts, and works in light, in dark and on
 paper. The templates escape every text. Python code prepares what they show.
@@ -13,6 +15,13 @@ from markupsafe import Markup, escape
 
 LIVING_PAGE = "me.html"
 """Name of the living avatar's page in a workspace."""
+METRICS = ("psnr", "ssim", "l1", "perceptual")
+"""Names of the figures of scored pictures."""
+COLUMNS = (
+    ("psnr", "PSNR, dB", 2, True), ("ssim", "SSIM", 3, True), ("l1", "L1", 4, False),
+    ("perceptual", "ST-LPIPS", 3, False),
+)  # fmt: skip
+"""Metric, heading, number of digits, whether higher is better."""
 
 
 def render(template: str, **content: object) -> Markup:

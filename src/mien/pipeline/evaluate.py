@@ -5,15 +5,16 @@ from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Any
 
+from mien.disk.files import expect_whole
 from mien.disk.inside import check_tree
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation.compare import Comparison, compare_runs
+from mien.evaluation.compare_report import write_comparison
 from mien.evaluation.evaluate import evaluate, is_evaluated
-from mien.evaluation.metrics_file import read_figures
+from mien.evaluation.metrics_file import REMEDY, read_metrics
 from mien.evaluation.protocols import EvaluationSettings
-from mien.evaluation.report.compare_report import write_comparison
-from mien.evaluation.report.text import dataset_line, driven_line, protocol_lines
+from mien.evaluation.text import dataset_line, driven_line, protocol_lines
 from mien.machine.progress import say
 from mien.training.run import read_run_config
 from mien.training.splits.named import DRIVING, NAMED_SPLIT, driving_sequences
@@ -39,15 +40,16 @@ def run_evaluation_stage(
     run_dir = workspace.run_dir(run)
     folders = run_sequences(workspace, run_dir)
     if not again and not drivers and is_evaluated(run_dir, folders, settings):
-        metrics = read_figures(run_dir)
+        metrics = read_metrics(run_dir)
     else:
         named = read_run_config(run_dir)["settings"]["split"] == NAMED_SPLIT
         metrics = evaluate(run_dir, folders, settings, driver_folders(drivers, driving_sequences if named else list))
-    for name, entry in metrics["protocols"].items():
-        for line in [driven_line(entry)] if name == "cross_reenactment" else protocol_lines(name, entry):
-            say(line)
-        if "dataset_protocol" in entry:
-            say(dataset_line(entry))
+    with expect_whole(run_dir / "metrics.json", REMEDY):
+        for name, entry in metrics["protocols"].items():
+            for line in [driven_line(entry)] if name == "cross_reenactment" else protocol_lines(name, entry):
+                say(line)
+            if "dataset_protocol" in entry:
+                say(dataset_line(entry))
     say(f"Look at {run_dir / 'report.html'}")
     return metrics
 

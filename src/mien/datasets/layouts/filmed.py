@@ -1,16 +1,19 @@
 """The frames of a tracked sequence that are written: those that mien trains on, and those that it holds out."""
 
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
 from mien.camera import Camera
-from mien.datasets.flame_poses import AXES, in_front
+from mien.datasets.flame_poses import AXES, face_of_flame, in_front
 from mien.datasets.layouts.layout import MatteKind
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.formats.shared.flame_params import flame_params_of
 from mien.rotation import matrix_from_axis_angle
 from mien.training.footage.foreground import foreground_colors
 from mien.training.footage.frames import held_out_of, training_frames
@@ -83,7 +86,7 @@ class Filmed:
     def face(self) -> FaceParams:
         """Return the faces at all written timesteps, seen by `flame_poses.FRONT` in place of the first camera."""
         face = self.sequence.tracking.face[self.timesteps]
-        return in_front(face, np.repeat(self.camera.viewmat.double().numpy()[None], len(face), 0))
+        return in_front(face, self.camera.viewmat.double().numpy())
 
     def head_to_camera(self) -> Float[np.ndarray, "t 4 4"]:
         """Return the head frame's pose at each written timestep in the first camera's OpenCV axes, in metres."""
@@ -95,14 +98,7 @@ class Filmed:
 
 
 def filmed_frames(sequence: Sequence, face_model: FaceModel, settings: TrainSettings, mattes: MatteKind) -> Filmed:
-    """Return the frames of a sequence that mien trains on, and those that it holds out. Others are left out.
-
-    Args:
-        sequence: The sequence.
-        face_model: The face model of its tracking.
-        settings: What is held out.
-        mattes: Mattes that are written.
-    """
+    """Return the frames of a sequence that mien trains on, and those that it holds out. Others are left out."""
     trained = {frame.timestep for frame in training_frames([sequence], settings)}
     left_out = held_out_of(sequence, settings.split).numpy()
     usable = sequence.usable().any(1)
@@ -118,6 +114,20 @@ def motion_between(rest: FaceParams, face: FaceParams) -> tuple[Float[np.ndarray
     turns = after @ before.mT
     shifts = face.head_translation.double() - torch.einsum("tij,tj->ti", turns, rest.head_translation.double())
     return turns.numpy(), shifts.numpy()
+
+
+def as_flame(
+    folder: Path, filmed: Filmed, face: FaceParams, poses: Items[str], shapes: int, expressions: int
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Float[np.ndarray, "t 3 3"], Float[np.ndarray, "t 3"]]:
+    """Return faces as FLAME's arrays: whole, and those that a layout holds, with so many coefficients.
+
+    Then follow the rigid motions that carry FLAME's heads with the latter to the faces: heads stay where they were
+    tracked, also if coefficients that move FLAME's joints are cut.
+    """
+    whole = flame_params_of(folder, filmed.face_model, face)
+    held = {name: whole[name].astype(np.float64) for name in poses}
+    held |= {"shape": padded(whole["shape"], shapes), "expr": padded(whole["expr"], expressions)}
+    return whole, held, *motion_between(face_of_flame(folder, filmed.face_model, held), face)
 
 
 def padded(values: np.ndarray, count: int) -> np.ndarray:

@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from mien.datasets.flame_poses import face_of_flame
-from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, padded
+from mien.datasets.layouts.filmed import Filmed, as_flame, lost_words
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.errors import UserError
-from mien.formats.shared.flame_params import flame_params_of
 from mien.machine.progress import track_progress
 from mien.media.picture_files import write_png
 
@@ -25,7 +23,10 @@ def write(folder: Path, filmed: Filmed) -> Written:
         raise UserError(
             f"{folder}: programs of this layout replace every 'image' in a path by 'mask'; give --out another name"
         )
-    arrays, shifts, told = _flame(folder, filmed)
+    whole, arrays, _, shifts = as_flame(folder, filmed, filmed.face(), _POSES, _SHAPES, _EXPRESSIONS)
+    lost = [*lost_words("identity", whole["shape"], _SHAPES), *lost_words("expression", whole["expr"], _EXPRESSIONS)]
+    if whole["static_offset"].any():
+        lost.append("Lost: the offsets of the mesh, for which the layout has no place.")
     rows = {timestep: index for index, timestep in enumerate(filmed.timesteps)}
     poses = np.concatenate([arrays[name] for name in _POSES], axis=1)
     subject = folder / folder.name
@@ -55,25 +56,9 @@ def write(folder: Path, filmed: Filmed) -> Written:
         "world_mat has another translation in each frame, because the head moves.",
         "Loaders replace every 'image' in a path by 'mask', so no folder above may have 'image' in its name.",
         "Not written: semantic, iris.json, keypoint.json, code.json and flame_keypoints.",
-        *told,
+        *lost,
     )
     return Written(names, told)
-
-
-def _flame(folder: Path, filmed: Filmed) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[str, ...]]:
-    """FLAME's arrays cut to what the layout holds, its origin's place before the camera [t, 3] in metres, what is lost.
-
-    The head stays where it was tracked, also if coefficients that move FLAME's joints are cut.
-    """
-    face = filmed.face()
-    whole = flame_params_of(folder, filmed.face_model, face)
-    told = [*lost_words("identity", whole["shape"], _SHAPES), *lost_words("expression", whole["expr"], _EXPRESSIONS)]
-    if whole["static_offset"].any():
-        told.append("Lost: the offsets of the mesh, for which the layout has no place.")
-    arrays = {name: whole[name].astype(np.float64) for name in _POSES}
-    arrays |= {"shape": padded(whole["shape"], _SHAPES), "expr": padded(whole["expr"], _EXPRESSIONS)}
-    turned = face_of_flame(folder, filmed.face_model, arrays)
-    return arrays, motion_between(turned, face)[1], tuple(told)
 
 
 def _intrinsics(filmed: Filmed) -> list[float]:

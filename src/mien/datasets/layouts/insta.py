@@ -4,6 +4,9 @@ With FLAME, the checkpoints of metrical-tracker are written as well, which INSTA
 """
 
 import math
+import pickle
+import zipfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,20 +17,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.datasets.flame_poses import AXES, FRONT, face_of_flame
-from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, padded
+from mien.datasets.flame_poses import AXES, FRONT
+from mien.datasets.layouts.filmed import Filmed, as_flame, lost_words, motion_between, padded
 from mien.datasets.layouts.layout import Written
-from mien.datasets.layouts.tracker_frame import write_tracker_frame
 from mien.datasets.layouts.writing import write_plain_json
 from mien.face.params import FaceParams
-from mien.formats.shared.flame_params import flame_params_of
 from mien.machine.progress import track_progress
 from mien.media.picture_files import write_png
 from mien.render.mesh import rasterize_mesh
+from mien.rotation import matrix_from_axis_angle
 
 _EXPRESSIONS, _SHAPES = 100, 300
-_VALIDATED = 20
-"""Number of pictures of the test at its end that val holds as well."""
+_VALIDATED = 20  # number of pictures of the test at its end that val holds as well
 _OPEN_RADIANS, _OPEN_SHARE = 0.2, 0.5
 """The mouth of canonical.obj: the angle of a jaw, or the coefficient of an expression that opens it."""
 _MILLIMETRES = 1000
@@ -102,15 +103,13 @@ def _at_rest(
 
 
 def _write_checkpoints(folder: Path, filmed: Filmed, face: FaceParams) -> tuple[str, ...]:
-    whole = flame_params_of(folder, filmed.face_model, face)
-    arrays = {name: whole[name].astype(np.float64) for name in ("jaw_pose", "eyes_pose")}
-    arrays |= {"shape": padded(whole["shape"], _SHAPES), "expr": padded(whole["expr"], _EXPRESSIONS)}
     # With neck and root at rest, the head itself is carried to its place.
-    turns, shifts = motion_between(face_of_flame(folder, filmed.face_model, arrays), face)
+    poses = "jaw_pose", "eyes_pose"
+    whole, arrays, turns, shifts = as_flame(folder, filmed, face, poses, _SHAPES, _EXPRESSIONS)
     for number in range(len(face)):
         row = {"shape": arrays["shape"], **{name: arrays[name][number] for name in ("expr", "jaw_pose", "eyes_pose")}}
         view = (AXES @ turns[number], AXES @ shifts[number], filmed.K)
-        write_tracker_frame(folder / "checkpoint" / f"{number:05d}.frame", row, view, filmed.size, number)
+        _write_tracker_frame(folder / "checkpoint" / f"{number:05d}.frame", row, view, filmed.size, number)
     told = [
         "checkpoint: files of metrical-tracker with the face model's coefficients. They are right for other programs "
         "only if it is FLAME 2020. Lids are 0. Lost in them: the neck joint, texture and light."
@@ -154,3 +153,44 @@ def _write_obj(path: Path, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}\n" for x, y, z in vertices.tolist()]
     path.write_text("".join(lines + [f"f {a} {b} {c}\n" for a, b, c in (faces + 1).tolist()]))
+
+
+def _write_tracker_frame(
+    path: Path, flame: Mapping[str, np.ndarray], view: tuple[np.ndarray, ...], size: tuple[int, int], number: int
+) -> None:
+    """Write a checkpoint of metrical-tracker: an archive of torch with a pickle of numpy arrays.
+
+    FLAME's root and neck are at rest in it, and the camera moves.
+
+    `flame` holds `shape` [300], `expr` [100], `jaw_pose` [3], and `eyes_pose` [6] (left, then right), axis-angles.
+    `view` is the world-to-camera rotation and translation with OpenCV's axes, in metres, and intrinsics in pixels.
+    """
+    rotation, translation, K = view
+    eyes = np.concatenate([_six(part) for part in np.split(flame["eyes_pose"], 2)], axis=1)
+    content = {
+        "flame": {
+            "exp": _row(flame["expr"]), "shape": _row(flame["shape"]), "jaw": _float32(_six(flame["jaw_pose"])),
+            "eyes": _float32(eyes), "eyelids": np.zeros((1, 2), np.float32),
+        },
+        "opencv": {"R": _row(rotation), "t": _row(translation), "K": _row(K)},
+        "img_size": np.array([size[1], size[0]]), "frame_id": f"{number:05d}", "global_step": 0,
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w") as archive:
+        # Pickles look for numpy's arrays in `numpy._core`, which the old numpy of those programs does not have.
+        pickled = pickle.dumps(content, protocol=2).replace(b"cnumpy._core.", b"cnumpy.core.")
+        archive.writestr("archive/data.pkl", pickled)
+        archive.writestr("archive/version", "3\n")
+
+
+def _six(axis_angle: np.ndarray) -> np.ndarray:
+    """The first two rows of a rotation, [1, 6]."""
+    return matrix_from_axis_angle(torch.from_numpy(axis_angle).double()).numpy()[:2].reshape(1, 6)
+
+
+def _row(array: np.ndarray) -> np.ndarray:
+    return _float32(array[None])
+
+
+def _float32(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array, np.float32)

@@ -1,4 +1,4 @@
-"""A layout: how a tracked capture is written as the files of another laboratory.
+"""A layout: how a tracked capture is written as the files of another laboratory. A new one is a file here and a line.
 
 This file needs no torch, because the command line lists the layouts and checks options against them.
 """
@@ -52,3 +52,16 @@ def check_new_folder(folder: Path) -> None:
     check_writable(folder, folder=True)
     if folder.exists() and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty, and a capture is written into a new folder; give another --out")
+
+
+LAYOUTS = (
+    Layout("insta", "INSTA, GaussianBlendshapes and RGBAvatar"),
+    Layout("imavatar", "IMavatar, PointAvatar, MonoGaussianAvatar and SplattingAvatar", needs_flame=True),
+    Layout("nerface", "NeRFace"),
+    Layout("nersemble", "the NeRSemble benchmark (version 2)", one_camera=False),
+)
+
+
+def find_layout(name: str | None) -> Layout | None:
+    """Return a layout by its name; None if there is none."""
+    return next((each for each in LAYOUTS if each.name == name), None)

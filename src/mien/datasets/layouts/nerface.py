@@ -9,14 +9,13 @@ import numpy as np
 from mien.datasets.layouts.filmed import Filmed, lost_words, padded
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
+from mien.datasets.overlay import spread_out
 from mien.machine.progress import track_progress
 from mien.media.picture_files import write_png
 
-_MEAN_DISTANCE = 0.5
-"""Mean distance of the camera from the head in its world; near and far planes are at 0.2 and 0.8."""
+_MEAN_DISTANCE = 0.5  # mean distance of the camera from the head in its world; near and far planes are at 0.2 and 0.8
 _NUMBERS = 76
-_VALIDATED = 5
-"""Number of training pictures that val holds once more."""
+_VALIDATED = 5  # number of training pictures that val holds once more
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
@@ -25,7 +24,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
     poses, scale = _poses(filmed)
     vectors, told = _vectors(filmed)
     rows = {timestep: index for index, timestep in enumerate(filmed.timesteps)}
-    spread = np.unique(np.linspace(0, len(filmed.trained) - 1, _VALIDATED).round().astype(int))
+    spread = spread_out(len(filmed.trained), _VALIDATED)
     parts = {"train": filmed.trained, "val": tuple(filmed.trained[index] for index in spread), "test": filmed.held_out}
     for part, timesteps in parts.items():
         frames = []

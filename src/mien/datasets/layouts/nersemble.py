@@ -14,12 +14,10 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.datasets.flame_poses import face_of_flame
-from mien.datasets.layouts.filmed import Filmed, lost_words, motion_between, padded
+from mien.datasets.layouts.filmed import Filmed, as_flame, lost_words
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.datasets.nersemble_benchmark import TEST_ENDING, TRACKING
-from mien.formats.shared.flame_params import flame_params_of
 from mien.machine.progress import say
 from mien.media.video_file import create_video
 
@@ -47,8 +45,9 @@ def write(folder: Path, filmed: Filmed) -> Written:
             names |= {(t, index): f"{part}_cam_{camera}_{number:05d}" for number, t in enumerate(timesteps)}
             if timesteps and index not in filmed.hidden:
                 say(f"write {part}, camera {camera}")
-                _write_video(place / "images" / f"cam_{camera}.mp4", _images(filmed, timesteps, index), capture.fps)
-                mattes = _mattes(filmed, timesteps, index)
+                images = (filmed.image(timestep, index) for timestep in timesteps)
+                mattes = (np.repeat(filmed.matte(timestep, index)[..., None], 3, axis=2) for timestep in timesteps)
+                _write_video(place / "images" / f"cam_{camera}.mp4", images, capture.fps)
                 _write_video(place / "alpha_maps" / f"cam_{camera}.mp4", mattes, capture.fps)
     told = [
         f"sequences/{capture.name} is trained on; sequences/{capture.name}{TEST_ENDING} is held out.",
@@ -88,11 +87,8 @@ def _flame(folder: Path, filmed: Filmed) -> tuple[dict[str, np.ndarray], tuple[s
 
     FLAME's root is at rest, and the whole model is turned about its origin.
     """
-    model, face = filmed.face_model, filmed.sequence.tracking.face[filmed.timesteps]
-    whole = flame_params_of(folder, model, face)
-    arrays = {name: whole[name].astype(np.float64) for name in _POSES}
-    arrays |= {"shape": padded(whole["shape"], _SHAPES), "expr": padded(whole["expr"], _EXPRESSIONS)}
-    turns, shifts = motion_between(face_of_flame(folder, model, arrays), face)
+    face = filmed.sequence.tracking.face[filmed.timesteps]
+    whole, arrays, turns, shifts = as_flame(folder, filmed, face, _POSES, _SHAPES, _EXPRESSIONS)
     told = ["tracking: right for other programs only if the face model is FLAME 2023."]
     if whole["static_offset"].any():
         told.append("Lost: the offsets of the mesh.")
@@ -111,14 +107,6 @@ def euler_xyz_of(turns: np.ndarray) -> np.ndarray:
     x = np.arctan2(-turns[:, 1, 2], turns[:, 2, 2])
     z = np.arctan2(-turns[:, 0, 1], turns[:, 0, 0])
     return np.stack([x, y, z], axis=1)
-
-
-def _images(filmed: Filmed, timesteps: tuple[int, ...], camera: int) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    return (filmed.image(timestep, camera) for timestep in timesteps)
-
-
-def _mattes(filmed: Filmed, timesteps: tuple[int, ...], camera: int) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    return (np.repeat(filmed.matte(timestep, camera)[..., None], 3, axis=2) for timestep in timesteps)
 
 
 def _write_video(path: Path, pictures: Iterator[UInt8[np.ndarray, "h w 3"]], fps: float) -> None:

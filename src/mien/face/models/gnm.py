@@ -19,8 +19,16 @@ from mien.disk.inside import is_plain_name
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, FaceModel
-from mien.face.models.flame import FLAME_LARGEST_COEFFICIENT
-from mien.face.models.npz import read_npz
+from mien.face.models.npz import read_npz, readable
+from mien.face.models.schema import (
+    LARGEST_COEFFICIENT,
+    check_arrays,
+    check_head,
+    check_indices,
+    check_numbers,
+    float_tensor,
+    rounded,
+)
 
 REGIONS = ("skin", "neck", "eyes", "irises", "teeth", "tongue", "mouth")
 """Regions that follow from the groups of vertices. `mien.tracking.landmarks` finds more, by landmarks."""
@@ -40,11 +48,6 @@ _SHAPES = {
 }  # fmt: skip
 _OPTIONAL = ("pose_correctives_regressor", "vertex_groups", "triangle_uvs")
 _TEXTS = ("joint_names", "expression_names", "vertex_group_names")
-_MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6
-"""Range of the height of a head with its neck, in metres."""
-_MAX_NUMBER = 1e6
-_MAX_NAME = 60
-_QUANTUM = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +79,10 @@ def is_gnm(names: list[str]) -> bool:
 def read_gnm(path: Path) -> GnmFile:
     """Read `gnm_head.npz`."""
     wanted = (*_SHAPES, *_OPTIONAL, *_TEXTS)
-    try:
+    with readable(path, "GNM Head", "download it again"):
         _, arrays = read_npz(path, wanted, texts=_TEXTS)
-    except Exception as error:  # a damaged archive may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as GNM Head ({reason}); download it again") from None
-    sizes: dict[str, int] = {}
-    for key, shape in _SHAPES.items():
-        _check(path, key, arrays, shape, sizes)
+    missing = "it is not in GNM's schema; give gnm_head.npz of version 3"
+    sizes = check_arrays(path, arrays, _SHAPES, missing, "download it again")
     joint_names = _names(path, "joint_names", arrays, 4)
     if sorted(joint_names) != sorted(_JOINTS):
         raise UserError(
@@ -93,9 +92,7 @@ def read_gnm(path: Path) -> GnmFile:
     parents = dict(zip(joint_names, arrays["joint_parent_indices"].tolist(), strict=True))
     if any(parents[child] != joint_names.index(parent) for child, parent in _PARENTS.items()):
         raise UserError(f"{path}: 'joint_parent_indices' are not those of GNM Head; download it again")
-    faces = arrays["triangles"].astype(np.int64)
-    if arrays["triangles"].dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= sizes["v"]:
-        raise UserError(f"{path}: 'triangles' has an index that is no vertex; download it again")
+    faces = check_indices(path, "triangles", arrays["triangles"], sizes["v"])
     gnm = GnmFile(
         arrays["template_vertex_positions"].astype(np.float64), faces,
         arrays["vertex_identity_basis"].astype(np.float32), arrays["expression_basis"].astype(np.float32),
@@ -131,54 +128,33 @@ def gnm_face_model(gnm: GnmFile, name: str) -> FaceModel:
         uv, uv_faces = flat, places.reshape(-1, 3).astype(np.int64)
     return FaceModel(
         name=name,
-        template=_rounded(gnm.template - origin),
+        template=rounded(gnm.template - origin),
         faces=torch.from_numpy(gnm.faces),
-        uv=_rounded(uv),
+        uv=rounded(uv),
         uv_faces=torch.from_numpy(uv_faces),
         region_names=REGIONS,
         face_regions=torch.from_numpy(_regions(gnm)),
-        identity_basis=_tensor(gnm.identity),
-        expression_basis=_tensor(gnm.expression),
+        identity_basis=float_tensor(gnm.identity),
+        expression_basis=float_tensor(gnm.expression),
         expression_names=gnm.expression_names,
-        expression_bounds=FLAME_LARGEST_COEFFICIENT * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
+        expression_bounds=LARGEST_COEFFICIENT * torch.tensor([[-1.0, 1.0]]).repeat(e, 1),
         expression_sigmas=torch.ones(e),
         joint_names=("head", "neck", "left_eye", "right_eye"),
         joint_parents=(-1, 0, 0, 0),
         joint_free=(False, True, True, True),
-        joint_template=_rounded(joints),
-        joint_identity_basis=_rounded(joint_identity),
+        joint_template=rounded(joints),
+        joint_identity_basis=rounded(joint_identity),
         joint_rotation_basis=torch.zeros(e, 4, 3),
         joint_translation_basis=torch.zeros(e, 4, 3),
-        skinning_weights=_tensor(weights),
-        pose_basis=None if gnm.correctives is None else _tensor(correctives.reshape(27, -1, 3)),
+        skinning_weights=float_tensor(weights),
+        pose_basis=None if gnm.correctives is None else float_tensor(correctives.reshape(27, -1, 3)),
         landmarks={},
     )
 
 
-def _check(path: Path, key: str, arrays: dict[str, np.ndarray], wanted: str, sizes: dict[str, int]) -> None:
-    if key not in arrays:
-        raise UserError(f"{path}: has no {key!r}, so it is not in GNM's schema; give gnm_head.npz of version 3")
-    array, symbols = arrays[key], wanted.split()
-    fits = array.ndim == len(symbols) and array.dtype.kind in "iuf"
-    for size, symbol in zip(array.shape, symbols, strict=False):
-        fits = fits and size > 0 and size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size))
-    if not fits:
-        known = " ".join(str(sizes.get(symbol, symbol)) for symbol in symbols)
-        raise UserError(
-            f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but should be numbers [{known}]; "
-            "download it again"
-        )
-    _check_values(path, key, array)
-
-
-def _check_values(path: Path, key: str, array: np.ndarray) -> None:
-    if not np.isfinite(array).all() or float(np.abs(array).max(initial=0)) > _MAX_NUMBER:
-        raise UserError(f"{path}: {key!r} holds numbers that are not finite or huge; download it again")
-
-
 def _names(path: Path, key: str, arrays: dict[str, np.ndarray], count: int) -> tuple[str, ...]:
     names = tuple(map(str, arrays[key].ravel().tolist())) if key in arrays else ()
-    plain = all(is_plain_name(name) and len(name) <= _MAX_NAME for name in names)
+    plain = all(is_plain_name(name) and len(name) <= 60 for name in names)
     if len(names) != count or len(set(names)) != count or not plain:
         raise UserError(f"{path}: {key!r} should be {count} different names; download it again")
     return names
@@ -193,7 +169,7 @@ def _correctives(
     if given.shape != (36, 3 * vertices):
         raise UserError(f"{path}: 'pose_correctives_regressor' is {list(given.shape)}, but should be "
                         f"[36, {3 * vertices}]; download it again")  # fmt: skip
-    _check_values(path, "pose_correctives_regressor", given)
+    check_numbers(path, "pose_correctives_regressor", given)
     if not given.any():
         return None
     correctives = given.reshape(4, 9, vertices, 3)[order].astype(np.float32)
@@ -224,20 +200,13 @@ def _corner_uv(path: Path, arrays: dict[str, np.ndarray], faces: int) -> Float[n
         raise UserError(
             f"{path}: 'triangle_uvs' is {list(given.shape)}, but should be [{faces}, 3, 2]; download it again"
         )
-    _check_values(path, "triangle_uvs", given)
+    check_numbers(path, "triangle_uvs", given)
     return given.astype(np.float64) if given.min() >= 0 and given.max() <= 1 else None
 
 
 def _check_sense(path: Path, gnm: GnmFile) -> None:
     """Check units, axes and joints, which shapes do not show."""
-    height = float(np.ptp(gnm.template[:, 1]))
-    if not _MIN_HEIGHT < height < _MAX_HEIGHT:
-        raise UserError(
-            f"{path}: the head is {height:g} high, but one in metres with y upwards is {_MIN_HEIGHT:g} to "
-            f"{_MAX_HEIGHT:g} high; download it again"
-        )
-    if not np.allclose(gnm.weights.sum(1), 1, atol=1e-3) or gnm.weights.min() < -1e-6:
-        raise UserError(f"{path}: 'skinning_weights' do not add up to 1 or are negative; download it again")
+    check_head(path, ("template_vertex_positions", "skinning_weights"), gnm.template, gnm.weights)
     eyes = gnm.joints[2:]
     ahead = eyes[:, 2].mean() > gnm.template[gnm.weights[:, 1] > 0.5][:, 2].mean()
     if eyes[0, 0] <= eyes[1, 0] or not ahead:
@@ -254,12 +223,3 @@ def _regions(gnm: GnmFile) -> Int[np.ndarray, " f"]:
         members = np.any([gnm.groups[name] for name in names], axis=0)
         regions[members[gnm.faces].all(1)] = REGIONS.index(region)
     return regions
-
-
-def _tensor(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
-
-
-def _rounded(values: np.ndarray) -> torch.Tensor:
-    """Round computed values to 0.1 micrometres. Their last digits depend on the machine and would change the hash."""
-    return _tensor(np.round(values / _QUANTUM) * _QUANTUM + 0.0)

@@ -6,7 +6,6 @@ tongue as the expressions move them, and the lids follow the eyes, as in the def
 the eyes, lashes, and the inner layer of the eyeballs are left out.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +14,13 @@ import torch
 from jaxtyping import Float, Int
 
 from mien.disk.inside import listed
+from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
 from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
-from mien.face.models.flame import FLAME_IRIS_RADIUS
-from mien.face.models.npz import read_npz
-from mien.face.models.obj_files import read_obj, read_obj_positions
+from mien.face.models.npz import read_npz, readable
+from mien.face.models.schema import in_iris, jaw_basis, neck_weights, rounded
 
 VERTICES, QUADS = 26719, 26384
 """Vertices and faces of the model. Faces are quads; a triangle has -1 as its last corner."""
@@ -31,23 +30,18 @@ PACKED_KEYS = ("v", "f_quad", "identity", "expression", "expression_names")
 NEUTRAL = "generic_neutral_mesh.obj"
 """File of the folder FaceXModel that holds the mean head."""
 
-_METERS = 0.01
-"""Metres in the model's unit."""
+_METERS = 0.01  # metres in the model's unit
 _MOUTH, _SOCKETS, _GUMS, _TEETH = (11248, 13294), (13294, 14062), (14062, 17039), (17039, 21451)
 _EYEBALLS = {"left_eye": (21451, 22221), "right_eye": (23021, 23791)}
 """Ranges of vertices, as the model's documentation lists them. Of each eyeball, the outer layer."""
 _KEPT = ((0, 21451), *_EYEBALLS.values())
-_UNSEEN = ("PupilDilate_L", "PupilDilate_R")
-"""Expressions of the inner layer of the eyeballs, which is left out."""
-_WHOLE = ("browInnerUp", "cheekPuff")
-"""Expressions of ARKit that the model has as two halves, which add up to them."""
+_UNSEEN = ("PupilDilate_L", "PupilDilate_R")  # expressions of the inner layer of the eyeballs, which is left out
+_WHOLE = ("browInnerUp", "cheekPuff")  # expressions of ARKit that the model has as two halves, which add up to them
 _NECK_PLANES = (-0.1185, -0.1688)
 """Values of y + 0.5 z, in metres in the head frame, at which the neck's weight is 0 and 1: the default model's."""
-_NECK_PIVOT = (-0.1359, -0.0136)
-"""Height and depth of the neck joint in the head frame, in metres: the default model's."""
+_NECK_PIVOT = (-0.1359, -0.0136)  # height and depth of the neck joint in the head frame, in metres: the default model's
 _LOWER_MOTION = 1.0
 """Motion in the model's unit, for a jaw that is wide open, from which teeth and tongue belong to the jaw."""
-_QUANTUM = 1e-7
 _MAX_IDENTITIES = 200
 _MAX_VALUE = 1e3
 
@@ -113,7 +107,6 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
     hinge, rotations, translations = jaw_motion(template, raw, lower & parts["teeth"])
     joints = np.stack([np.zeros(3), np.array([0.0, *_NECK_PIVOT]), hinge, *centers])
     identity = _METERS * ict.identity[:, kept]
-    rotation_basis, translation_basis = (_of_the_jaw(names, motions) for motions in (rotations, translations))
     correctives = lid_correctives(template, raw, parts)
     deltas = np.stack(list(raw.values()))
     deltas[:, inside | parts["left_eye"] | parts["right_eye"]] = 0
@@ -122,14 +115,14 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
     uv, uv_faces = unwrap(template, faces)
     return FaceModel(
         name=name,
-        template=_rounded(template),
+        template=rounded(template),
         faces=torch.from_numpy(faces),
-        uv=_rounded(uv),
+        uv=rounded(uv),
         uv_faces=torch.from_numpy(uv_faces),
         region_names=REGIONS,
         face_regions=torch.from_numpy(_regions(template, faces, weights, parts, centers)),
-        identity_basis=_rounded(identity),
-        expression_basis=_rounded(deltas),
+        identity_basis=rounded(identity),
+        expression_basis=rounded(deltas),
         expression_names=names,
         expression_bounds=torch.tensor(
             [[0.0, 0.0 if each in PINNED or each.startswith("eyeLook") else 1.0] for each in names]
@@ -137,26 +130,18 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
         joint_names=JOINTS,
         joint_parents=JOINT_PARENTS,
         joint_free=(False, True, False, True, True),
-        joint_template=_rounded(joints),
-        joint_identity_basis=_rounded(_joint_identities(identity, weights, parts)),
-        joint_rotation_basis=_rounded(rotation_basis),
-        joint_translation_basis=_rounded(translation_basis),
-        skinning_weights=_rounded(weights),
-        pose_basis=_rounded(correctives),
+        joint_template=rounded(joints),
+        joint_identity_basis=rounded(_joint_identities(identity, weights, parts)),
+        joint_rotation_basis=rounded(jaw_basis(names, rotations)),
+        joint_translation_basis=rounded(jaw_basis(names, translations)),
+        skinning_weights=rounded(weights),
+        pose_basis=rounded(correctives),
         landmarks={},
     )
 
 
-def _of_the_jaw(names: tuple[str, ...], motions: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The motions of all joints by each expression, [e, j, 3], of which only the jaw's are not 0."""
-    basis = np.zeros((len(names), len(JOINTS), 3))
-    for each in JAW_EXPRESSIONS:
-        basis[names.index(each), JOINTS.index("jaw")] = motions[each]
-    return basis
-
-
 def _read_packed(path: Path) -> IctFile:
-    try:
+    with readable(path, "ICT-FaceKit", "give its folder FaceXModel"):
         _, found = read_npz(path, PACKED_KEYS, texts=("expression_names",))
         for key in PACKED_KEYS:
             if key not in found:
@@ -167,15 +152,8 @@ def _read_packed(path: Path) -> IctFile:
         if len(found["identity"]) > _MAX_IDENTITIES or found["f_quad"].dtype.kind not in "iu":
             raise ValueError("its arrays do not have the shapes of the packed copy")
         by_name = {str(each): delta for each, delta in zip(names, expression, strict=True)}
-        return IctFile(
-            found["v"].astype(np.float64), found["f_quad"].astype(np.int64), found["identity"].astype(np.float32),
-            by_name,
-        )  # fmt: skip
-    except UserError:
-        raise
-    except Exception as error:  # a damaged archive may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as ICT-FaceKit ({reason}); give its folder FaceXModel") from None
+        identity = found["identity"].astype(np.float32)
+        return IctFile(found["v"].astype(np.float64), found["f_quad"].astype(np.int64), identity, by_name)
 
 
 def _read_folder(path: Path) -> IctFile:
@@ -216,9 +194,7 @@ def _by_arkit(raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _weights(template: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v 5"]:
     weights = np.zeros((len(template), len(JOINTS)))
-    top, bottom = _NECK_PLANES
-    t = np.clip((top - template[:, 1] - 0.5 * template[:, 2]) / (top - bottom), 0, 1)
-    weights[:, JOINTS.index("neck")] = t * t * (3 - 2 * t)
+    weights[:, JOINTS.index("neck")] = neck_weights(template[:, 1] + 0.5 * template[:, 2], _NECK_PLANES)
     weights[parts["inside"] | parts["mouth"]] = 0
     for joint, part in (("jaw", "lower"), ("left_eye", "left_eye"), ("right_eye", "right_eye")):
         weights[parts[part]] = 0
@@ -249,14 +225,39 @@ def _regions(
     for name, part in {**named, "eye_sockets": parts["sockets"]}.items():
         regions[part[faces].all(1)] = REGIONS.index(name)
     for side, center in zip(("left_eye", "right_eye"), centers, strict=True):
-        rays = template - center
-        ahead = (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < FLAME_IRIS_RADIUS)
         ball = parts[side][faces].all(1)
         regions[ball] = REGIONS.index("eyes")
-        regions[ball & ahead[faces].all(1)] = REGIONS.index("irises")
+        regions[ball & in_iris(template, center)[faces].all(1)] = REGIONS.index("irises")
     return regions
 
 
-def _rounded(values: np.ndarray) -> torch.Tensor:
-    """Round to 0.1 micrometres. The last digits depend on the machine and would change the hash."""
-    return torch.from_numpy(np.ascontiguousarray(np.round(values / _QUANTUM) * _QUANTUM + 0.0, np.float32))
+def read_obj(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "q 4"]]:
+    """Return positions and faces of three or four corners; -1 is the last corner of a triangle."""
+    with readable(path, ".obj", "download it again"):
+        lines = _lines(path)
+        corners = [[int(part.split(b"/")[0]) - 1 for part in line.split()[1:]] for line in lines if line[:2] == b"f "]
+        if not corners or not all(len(each) in (3, 4) for each in corners):
+            raise ValueError("its faces do not have three or four corners")
+        return _positions(lines), np.array([(*each, -1)[:4] for each in corners], np.int64)
+
+
+def read_obj_positions(path: Path, count: int) -> Float[np.ndarray, "v 3"]:
+    """Return the positions of a file that has `count` of them."""
+    with readable(path, ".obj", "download it again"):
+        lines = _lines(path)
+        positions = _positions(lines)
+        if len(positions) != count:
+            raise ValueError(f"{len(positions):,} vertices instead of {count:,}")
+        return positions
+
+
+def _lines(path: Path) -> list[bytes]:
+    return read_bytes(path, 64 << 20).splitlines()  # those of ICT-FaceKit have 3 MB
+
+
+def _positions(lines: list[bytes]) -> Float[np.ndarray, "v 3"]:
+    rows = (line.split()[1:4] for line in lines if line[:2] == b"v ")
+    positions = np.array([[float(value) for value in row] for row in rows])
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError("a vertex does not have three coordinates")
+    return positions

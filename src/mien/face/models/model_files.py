@@ -32,11 +32,8 @@ def licence_of(path: Path) -> str | None:
 def read_model_file(path: Path, name: str, shareable: bool = False, teeth: bool = False) -> FaceModel:
     """Read a face model of any schema, without landmarks: FLAME's, GNM's, or ICT-FaceKit.
 
-    Args:
-        path: The file, or the folder FaceXModel of ICT-FaceKit.
-        name: Name of the face model.
-        shareable: Whether the licence of a model in FLAME's schema lets avatars carry a copy. Those of GNM and ICT do.
-        teeth: Whether FLAME gets the teeth of GaussianAvatars.
+    `shareable` says whether the licence of a model in FLAME's schema lets avatars carry a copy (those of GNM and ICT
+    do), and `teeth` whether FLAME gets the teeth of GaussianAvatars.
     """
     members = _members(path)
     others = is_gnm(members) or is_ict_folder(path) or _is_packed_ict(members)

@@ -5,13 +5,14 @@
 
 import io
 import math
-import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from mien.disk.reading import open_archive, open_member, open_ordinary
+from mien.errors import UserError
 
 MAX_MODEL_BYTES = 256 << 20
 """Largest size of all arrays of a face model together, in bytes. FLAME 2023 has 60 MB."""
@@ -20,8 +21,21 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _ENDING = ".npy"
-_NUMBERS = "biuf"
-"""Kinds of plain numbers, by numpy's letters."""
+_NUMBERS = "biuf"  # kinds of plain numbers, by numpy's letters
+
+
+@contextmanager
+def readable(path: Path, kind: str, remedy: str) -> Iterator[None]:
+    """Tell in one line why a user's file cannot be read as what it should be, whatever is wrong with it."""
+    try:
+        yield
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise UserError(f"{path}: is missing; {remedy}") from None
+    except Exception as error:  # a damaged file may fail in any way
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{path}: cannot be read as {kind} ({reason}); {remedy}") from None
 
 
 def read_npz(
@@ -29,12 +43,7 @@ def read_npz(
 ) -> tuple[list[str], dict[str, np.ndarray]]:
     """Return the names of all members of an .npz, and its wanted arrays of plain numbers.
 
-    Those that `texts` names may hold texts of a fixed length instead.
-
-    Raises:
-        ValueError: a wanted member is no array of plain numbers, occurs twice, or is damaged; or the arrays are larger
-            than `MAX_MODEL_BYTES`.
-        Exception: whatever Python's `zipfile` raises for a file that is no archive or a damaged one.
+    Those that `texts` names may hold texts of a fixed length instead. A damaged file raises any error: `readable`.
     """
     with open_ordinary(path) as file, open_archive(file) as archive:
         members = archive.infolist()
@@ -47,24 +56,16 @@ def read_npz(
             if name in arrays:
                 raise ValueError(f"{name!r} occurs twice")
             try:
-                arrays[name] = _read_member(archive, member, left, _NUMBERS + "U" if name in texts else _NUMBERS)
+                with open_member(archive, member) as content:
+                    arrays[name] = _read_array(content, left, _NUMBERS + "U" if name in texts else _NUMBERS)
             except ValueError as error:
                 raise ValueError(f"{name!r}: {error}") from None
             left -= arrays[name].nbytes
     return names, arrays
 
 
-def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, limit: int, kinds: str) -> np.ndarray:
-    with open_member(archive, member) as file:
-        return _read_array(file, limit, kinds)
-
-
 def parse_npy(data: bytes) -> np.ndarray:
-    """Return the array in the bytes of an .npy file.
-
-    Raises:
-        ValueError: it is no array of plain numbers, or damaged.
-    """
+    """Return the array of plain numbers in the bytes of an .npy file."""
     return _read_array(io.BytesIO(data), len(data))
 
 

@@ -16,15 +16,12 @@ from mien.face.models.flame import FlameFile
 VERTICES, FACES = 5023, 9976
 """Vertices and triangles of FLAME."""
 TOOTH_VERTICES = 120
-_COUNT = 15
-"""Vertices of a row."""
+_COUNT = 15  # vertices of a row
 UPPER_LIP = (1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830)
 LOWER_LIP = (1576, 1577, 1773, 1774, 1795, 1802, 1865, 3503, 2948, 2905, 2898, 2881, 2880, 2713, 2712)
 """FLAME's vertices on the outer ring of the upper and the lower lip, from the subject's left to the right."""
-_U, _V = (0.62, 0.38), (0.9917, 0.9575)
-"""Texture coordinates at the ends of rows, and of the first and the last row."""
-_V_OF_ROW = (3, 2, 0, 1, 3, 4, 6, 5)
-"""Index among seven equal steps of v, for each row."""
+_U, _V = (0.62, 0.38), (0.9917, 0.9575)  # texture coordinates at the ends of rows, and of the first and the last row
+_V_OF_ROW = (3, 2, 0, 1, 3, 4, 6, 5)  # index among seven equal steps of v, for each row
 _UPPER_ROWS = (0, 2, 4, 5)
 """Rows that belong to the upper teeth, which move with the neck joint. The others move with the jaw."""
 _STRIPS = (
@@ -42,9 +39,7 @@ the two triangles of its first square, on the left half and on the right. The ne
 def with_teeth(flame: FlameFile, name: str) -> FlameFile:
     """Return FLAME with teeth: 120 vertices and 168 triangles more, in the order of GaussianAvatars.
 
-    Args:
-        flame: FLAME with its own 5,023 vertices in their order.
-        name: The file, for messages.
+    FLAME has its own 5,023 vertices in their order. `name` is the file, for messages.
     """
     if flame.template.shape != (VERTICES, 3) or flame.faces.shape != (FACES, 3):
         raise UserError(

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from mien.disk.files import write_atomically
 from mien.disk.inside import inside
 from mien.disk.reading import read_bytes
-from mien.evaluation.report.page import Card, Cell, DataTable, Picture, video_of
+from mien.evaluation.page_parts import Card, Cell, DataTable, Picture, video_of
 from mien.lab.analysis.result import chart_from
 from mien.lab.analysis.spec import Analysis
 from mien.media.pictures import data_uri

@@ -1,7 +1,6 @@
 """The parts of report.html with pictures and charts."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ from mien.evaluation.experiment import DARK, Experiment, avatar_image, head_box,
 from mien.evaluation.living import SIDE, Living, strip, to_bytes
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES, OVER_DARK_NAME
+from mien.evaluation.page_parts import Card, Cell, DataTable, Picture, figure_text, picture_of, video_of
 from mien.evaluation.protocols import AVATAR, MESH, OVER_DARK, Evaluation
-from mien.evaluation.report.page import Card, Cell, DataTable, Picture, Video, figure_text, picture_of, video_of
 from mien.media.pictures import Box, error_heat, picture_uri, to_uint8
 from mien.pages.plots import Axes, Series, line_chart
 from mien.render.mesh import render_mesh
@@ -49,53 +48,7 @@ _CROSS_NOTE = (
 )
 
 
-@dataclass(frozen=True)
-class Hero:
-    """What a report opens with: the avatar alive, a filmed frame beside it, and a strip of its faces."""
-
-    film: Video
-    poster: str
-    """Data URI of the first picture of the film."""
-    filmed: Picture
-    faces: Sequence[Picture]
-
-
-@dataclass(frozen=True)
-class ComparedFrame:
-    """A held-out frame as truth, rendering and error."""
-
-    rank: str
-    """`best`, `median`, `worst`, or empty."""
-    frame: str
-    figures: str
-    pictures: Sequence[Picture]
-
-
-@dataclass(frozen=True)
-class Filmed:
-    """The part of the head that the training pictures show."""
-
-    pictures: Sequence[Picture]
-    note: str
-
-
-@dataclass(frozen=True)
-class TrackedSequence:
-    """How the mesh was tracked in a sequence."""
-
-    pictures: Sequence[Picture]
-    residuals: Card
-
-
-@dataclass(frozen=True)
-class CrossSection:
-    """Cross-reenactment."""
-
-    table: DataTable
-    videos: Sequence[Video]
-
-
-def comparison(experiment: Experiment, evaluation: Evaluation) -> list[ComparedFrame]:
+def comparison(experiment: Experiment, evaluation: Evaluation) -> list[dict[str, Any]]:
     """Truth, rendering and error of the best, the median and the worst held-out frame, and of some between."""
     ranked = evaluation.ranked()
     middle = len(ranked) // 2
@@ -114,7 +67,7 @@ def _places(count: int, middle: int) -> list[int]:
     return places[::-1]
 
 
-def _compared_frame(experiment: Experiment, evaluation: Evaluation, index: int, rank: str, box: Box) -> ComparedFrame:
+def _compared_frame(experiment: Experiment, evaluation: Evaluation, index: int, rank: str, box: Box) -> dict[str, Any]:
     frame, scores = evaluation.frames[index], evaluation.scores[AVATAR][index]
     target, image = target_image(experiment, frame), avatar_image(experiment, frame)
     whole = (to_uint8(target), to_uint8(image), error_heat(image, target))
@@ -126,7 +79,7 @@ def _compared_frame(experiment: Experiment, evaluation: Evaluation, index: int, 
         picture_of(picture, what, _PICTURE_SIZE)
         for picture, what in zip(pictures, ("truth", "rendering", "error"), strict=True)
     ]
-    return ComparedFrame(rank, frame_name(experiment, frame), figures, shown)
+    return {"rank": rank, "frame": frame_name(experiment, frame), "figures": figures, "pictures": shown}
 
 
 def over_time(experiment: Experiment, evaluation: Evaluation) -> list[Card]:
@@ -192,7 +145,7 @@ def _smooth(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @torch.no_grad()
-def tracking_overlays(experiment: Experiment) -> list[TrackedSequence]:
+def tracking_overlays(experiment: Experiment) -> list[dict[str, Any]]:
     """The tracked mesh over evenly spread frames, and the landmark residuals over time."""
     parts = []
     for index, sequence in enumerate(experiment.sequences):
@@ -205,7 +158,7 @@ def tracking_overlays(experiment: Experiment) -> list[TrackedSequence]:
         median = float(np.nanmedian(residuals)) if np.isfinite(residuals).any() else float("nan")
         title = f"Landmark residual, median of each frame, pixels · {sequence.name} · median {median:.2f} px"
         chart = line_chart(lines, Axes("timestep", "residual, pixels", 1080, 200, from_zero=True))
-        parts.append(TrackedSequence(pictures, Card(title, chart)))
+        parts.append({"pictures": pictures, "residuals": Card(title, chart)})
     return parts
 
 
@@ -241,7 +194,7 @@ def baseline_pictures(experiment: Experiment, evaluation: Evaluation) -> list[Pi
 
 
 @torch.no_grad()
-def confidence(avatar: Avatar, coverage: Coverage) -> Filmed:
+def confidence(avatar: Avatar, coverage: Coverage) -> dict[str, Any]:
     """The neutral head coloured by how well training pictures show it: from the front, the side and behind."""
     neutral = avatar.face_model.head_vertices(avatar.subject)[0].cpu().float()
     model = avatar.face_model.to(neutral)
@@ -250,10 +203,10 @@ def confidence(avatar: Avatar, coverage: Coverage) -> Filmed:
         picture = confidence_picture(model, neutral, coverage, yaw, _OVERLAY_SIZE)
         pictures.append(picture_of(to_uint8(picture), name, _OVERLAY_SIZE, name))
     note = f"{filmed_words(model, neutral, coverage)}. {_CONFIDENCE_NOTE}"
-    return Filmed(pictures, note[0].upper() + note[1:])
+    return {"pictures": pictures, "note": note[0].upper() + note[1:]}
 
 
-def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder: Path) -> CrossSection:
+def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder: Path) -> dict[str, Any]:
     """The table and the videos of cross-reenactment."""
     head = [Cell("Driver"), *(Cell(name) for _, name, _ in _CROSS_COLUMNS)]
     rows = [
@@ -261,11 +214,11 @@ def cross_section(entry: Mapping[str, Any], videos: Sequence[Path], page_folder:
         for driver in entry["drivers"]
     ]
     shown = [video_of(path, page_folder, "Driver, avatar") for path in videos]
-    return CrossSection(DataTable([head], rows, _CROSS_NOTE), shown)
+    return {"table": DataTable([head], rows, _CROSS_NOTE), "videos": shown}
 
 
-def hero(alive: Living, film: Path, result: tuple[Experiment, Evaluation]) -> Hero:
-    """The avatar alive. The filmed frame is the first held-out one."""
+def hero(alive: Living, film: Path, result: tuple[Experiment, Evaluation]) -> dict[str, Any]:
+    """The avatar alive, the first held-out frame beside it, and a strip of its faces."""
     experiment, evaluation = result
     picture = to_bytes(alive.avatar.render(camera=alive.camera)[0])
     filmed = to_uint8(target_image(experiment, evaluation.frames[0]))
@@ -273,12 +226,12 @@ def hero(alive: Living, film: Path, result: tuple[Experiment, Evaluation]) -> He
         picture_of(face, f"The avatar: {name}", _OVERLAY_SIZE, name.replace("_", " ").capitalize())
         for name, face in strip(alive)
     ]
-    return Hero(
-        video_of(film, film.parent, "The avatar in motion"),
-        picture_uri(picture),
-        picture_of(filmed, "A filmed frame", SIDE, "A filmed frame that training never saw"),
-        faces,
-    )
+    return {
+        "film": video_of(film, film.parent, "The avatar in motion"),
+        "poster": picture_uri(picture),
+        "filmed": picture_of(filmed, "A filmed frame", SIDE, "A filmed frame that training never saw"),
+        "faces": faces,
+    }
 
 
 def frame_name(experiment: Experiment, frame: Frame) -> str:

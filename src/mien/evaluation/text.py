@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mien.evaluation.compare import Comparison, Row, Table
-from mien.evaluation.metrics_file import BASELINE_NAMES, FACE_SOURCE_NAMES, FITTED_NAME, OVER_DARK_NAME, figure
+from mien.evaluation.compare_report import costs, row_cells
+from mien.evaluation.metrics_file import BASELINE_NAMES, FACE_SOURCE_NAMES, FITTED_NAME, OVER_DARK_NAME
 from mien.machine.terminal import printable
-from mien.pages.metric_names import COLUMNS
+from mien.pages.pages import COLUMNS
 
 _BOLD, _PLAIN = "\x1b[1m", "\x1b[0m"
 _FURTHER = {"opened": "eroded and dilated", "without_clothes": "the same without clothes"}
@@ -26,7 +27,10 @@ def protocol_lines(name: str, entry: Mapping[str, Any]) -> list[str]:
     rows |= {BASELINE_NAMES[key]: baseline for key, baseline in entry["baselines"].items()}
     width = max(map(len, rows))
     heading = f"{name} ({entry['split']}, {entry['frames']} frames): PSNR of the whole frame / of the head crop"
-    return [heading, *(f"  {words:<{width}}  {_both(row)}" for words, row in rows.items())]
+    return [
+        heading,
+        *(f"  {words:<{width}}  {row['psnr']:.2f} / {row['head']['psnr']:.2f} dB" for words, row in rows.items()),
+    ]
 
 
 def dataset_line(entry: Mapping[str, Any]) -> str:
@@ -72,14 +76,8 @@ def _table_text(table: Table, bold: bool) -> str:
     """A heading and an aligned table: first the whole frame, then the head crop."""
     sequences = ", ".join(sorted(set(table.rows[0].entry["per_frame"]["sequence"])))
     title = printable(f"{table.protocol}: {table.frames} held-out frames of {sequences} ({table.ground})")
-    extra = ("Gaussians", "training", "ms/frame")
-    heads = [
-        "",
-        "faces",
-        *(heading for _, heading, _, _ in COLUMNS),
-        *(heading for _, heading, _, _ in COLUMNS),
-        *extra,
-    ]
+    headings = [heading for _, heading, _, _ in COLUMNS]
+    heads = ["", "faces", *headings, *headings, "Gaussians", "training", "ms/frame"]
     lines = [[(text, False) for text in heads]]
     lines += [_cells(table, row) for row in table.rows]
     widths = [max(len(line[i][0]) for line in lines) for i in range(len(heads))]
@@ -95,21 +93,9 @@ def _table_text(table: Table, bold: bool) -> str:
 def _cells(table: Table, row: Row) -> list[tuple[str, bool]]:
     """The texts of a row, each with whether it is the best of its column."""
     cells = [(printable(row.label), False), (printable(row.faces), False)]
-    for part, _ in _PARTS:
-        for metric, _, digits, higher in COLUMNS:
-            value = figure(row.entry, part, metric)
-            best = table.best(part, metric, higher) if row.run is not None else None
-            text = "-" if value is None else f"{value:.{digits}f}"
-            cells.append((text, best is not None and value is not None and round(value, digits) == best))
-    if row.run is None:
-        return cells + [("", False)] * 3
-    training = row.run.metrics["training"]
-    extra = (
-        f"{training['gaussians']:,}",
-        f"{training['seconds']:.0f} s",
-        f"{1e3 * row.entry['seconds_per_frame']:.1f}",
-    )
-    return cells + [(text, False) for text in extra]
+    cells += [(cell.text.replace("–", "-"), cell.best) for cell in row_cells(table, row)]
+    gaussians, seconds, milliseconds = costs(row)
+    return cells + [(text, False) for text in (gaussians, f"{seconds} s" if seconds else "", milliseconds)]
 
 
 def _line(cells: Sequence[tuple[str, bool]], widths: Sequence[int], bold: bool) -> str:
@@ -118,10 +104,6 @@ def _line(cells: Sequence[tuple[str, bool]], widths: Sequence[int], bold: bool) 
         shown, padding = f"{_BOLD}{text}{_PLAIN}" if bold and best else text, " " * (width - len(text))
         texts.append(shown + padding if index < 2 else padding + shown)
     return "  ".join(texts).rstrip()
-
-
-def _both(entry: Mapping[str, Any]) -> str:
-    return f"{entry['psnr']:.2f} / {entry['head']['psnr']:.2f} dB"
 
 
 def _figures(entry: Mapping[str, Any]) -> str:

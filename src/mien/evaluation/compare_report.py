@@ -1,9 +1,9 @@
 """compare.html: the tables, and the same held-out frames as rendered by every run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,23 +14,21 @@ from mien.evaluation.experiment import Experiment, avatar_image, head_box, targe
 from mien.evaluation.living import FILM
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import PROTOCOL_NAMES, figure
-from mien.evaluation.report.page import (
-    GLOSSARY,
+from mien.evaluation.metrics_file import PROTOCOL_NAMES
+from mien.evaluation.page_parts import (
     Card,
     Cell,
     DataTable,
     Picture,
-    figure_text,
+    metric_cells,
     metric_groups,
     metric_headings,
     picture_of,
 )
-from mien.evaluation.report.report_sections import frame_name
+from mien.evaluation.report_sections import frame_name
 from mien.machine.progress import track_progress
 from mien.media.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
 from mien.media.video import read_video_frames
-from mien.pages.metric_names import COLUMNS
 from mien.pages.pages import render
 from mien.pages.plots import Axes, Series, line_chart
 from mien.training.footage.frames import Frame
@@ -38,67 +36,34 @@ from mien.training.footage.frames import Frame
 _FRAMES = 5
 _PICTURE_SIZE = 320
 _MAX_RUNS = 8
-_PARTS = (None, "head")
-_STYLES = ("main", "second", "third", "fourth")
-"""Styles of the curves of the first runs. Those of more runs are quiet."""
+_STYLES = ("main", "second", "third", "fourth")  # styles of the curves of the first runs. Those of more runs are quiet
 
 
 def write_comparison(path: Path, comparison: Comparison, sequence_dirs: Mapping[Path, Sequence[Path]]) -> None:
-    """Write the page.
-
-    Args:
-        path: The .html file.
-        comparison: The comparison to show.
-        sequence_dirs: The folders of the sequences of each run, by the run's folder.
-    """
+    """Write the page. `sequence_dirs` are the folders of the sequences of each run, by the run's folder."""
     frames = [_pictures(table, sequence_dirs) for table in comparison.tables]
-    text = comparison_html(comparison, frames, _films(comparison.runs, path.parent))
-    write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
-
-
-@dataclass(frozen=True)
-class _DrawnFrame:
-    """A held-out frame: the truth and the rendering of every run in a row, their errors below."""
-
-    names: Sequence[str]
-    pictures: Sequence[Picture]
-    errors: Sequence[Picture]
-    notes: Sequence[str]
-
-
-@dataclass(frozen=True)
-class _Film:
-    """The film of a run's avatar in motion."""
-
-    label: str
-    poster: str
-    """Data URI of its first picture."""
-    source: str
-    """Data URI."""
-
-
-def comparison_html(
-    comparison: Comparison, frames: Sequence[Sequence[_DrawnFrame]], films: Sequence[_Film] = ()
-) -> str:
-    """The page as text. `frames` holds the drawn frames of each table."""
-    return render(
+    text = render(
         "evaluation/templates/compare.html",
         runs=", ".join(run.label for run in comparison.runs),
-        films=films,
+        films=_films(comparison.runs),
         warnings=comparison.warnings,
         sections=[
             {"heading": _heading(table), "table": _data_table(table), "chart": _chart(table), "frames": shown}
             for table, shown in zip(comparison.tables, frames, strict=True)
         ],
-        glossary=GLOSSARY,
     )
+    write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
-def _films(runs: Sequence[ScoredRun], page_folder: Path) -> list[_Film]:
+def _films(runs: Sequence[ScoredRun]) -> list[dict[str, str]]:
     """The films of the first runs that have one. All show the same motion, so they can be watched side by side."""
     found = [(run.label, run.run_dir / FILM) for run in runs if (run.run_dir / FILM).is_file()]
     return [
-        _Film(label, picture_uri(next(read_video_frames(path))[1]), data_uri("video/mp4", path.read_bytes()))
+        {
+            "label": label,
+            "poster": picture_uri(next(read_video_frames(path))[1]),
+            "source": data_uri("video/mp4", path.read_bytes()),
+        }
         for label, path in found[:_MAX_RUNS]
     ]
 
@@ -129,22 +94,28 @@ def _data_table(table: Table) -> DataTable:
 
 
 def _cells(table: Table, row: Row) -> list[Cell]:
-    cells = [Cell(row.label), Cell(row.faces, "left")]
-    for part in _PARTS:
-        for index, (metric, _, digits, higher) in enumerate(COLUMNS):
-            value = figure(row.entry, part, metric)
-            best = table.best(part, metric, higher) if row.run is not None else None
-            wins = best is not None and value is not None and round(value, digits) == best
-            cells.append(Cell(figure_text(value, digits), "head" if part and index == 0 else "", best=wins))
+    gaussians, seconds, milliseconds = costs(row)
+    return [
+        Cell(row.label), Cell(row.faces, "left"), *row_cells(table, row),
+        Cell(gaussians, "head"), Cell(seconds), Cell(milliseconds),
+    ]  # fmt: skip
+
+
+def row_cells(table: Table, row: Row) -> list[Cell]:
+    """The figures of a row on the whole frame and on the head crop. Only runs are the best of a column."""
+    return metric_cells(row.entry, (None, "head"), table.best if row.run is not None else lambda *_: None)
+
+
+def costs(row: Row) -> tuple[str, str, str]:
+    """Number of Gaussians, seconds of training and milliseconds per frame. Empty for other rows than runs."""
     if row.run is None:
-        return [*cells, Cell("", "head"), Cell(""), Cell("")]
-    training, milliseconds = row.run.metrics["training"], 1e3 * row.entry["seconds_per_frame"]
-    costs = (f"{training['gaussians']:,}", f"{training['seconds']:.0f}", f"{milliseconds:.1f}")
-    return [*cells, Cell(costs[0], "head"), *map(Cell, costs[1:])]
+        return "", "", ""
+    training = row.run.metrics["training"]
+    return f"{training['gaussians']:,}", f"{training['seconds']:.0f}", f"{1e3 * row.entry['seconds_per_frame']:.1f}"
 
 
-def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> list[_DrawnFrame]:
-    """Some frames of a table."""
+def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> list[dict[str, Any]]:
+    """Some frames of a table: the truth and the rendering of every run in a row, and their errors."""
     runs = [row.run for row in table.rows if row.run is not None][:_MAX_RUNS]
     count = len(table.rows[0].entry["per_frame"]["psnr"])
     places = sorted({round(index * (count - 1) / max(1, _FRAMES - 1)) for index in range(_FRAMES)})
@@ -164,29 +135,26 @@ def _pictures(table: Table, sequence_dirs: Mapping[Path, Sequence[Path]]) -> lis
         boxes = [head_box(experiment, [frame]) for frame in frames]
         columns.append([_drawn(experiment, frame, box) for frame, box in zip(frames, boxes, strict=True)])
         if not truths:
-            truths = [_truth(experiment, frame, box) for frame, box in zip(frames, boxes, strict=True)]
+            for frame, box in zip(frames, boxes, strict=True):
+                cut = to_uint8(crop_to(target_image(experiment, frame), box))
+                truths.append(picture_of(cut, "truth", _PICTURE_SIZE))
             captions = [frame_name(experiment, frame) for frame in frames]
     drawn = []
     for index, caption in enumerate(captions):
         figures = [run.metrics["protocols"][table.protocol]["per_frame"]["head_psnr"][places[index]] for run in runs]
         drawn.append(
-            _DrawnFrame(
-                names=["Truth", *(run.label for run in runs)],
-                pictures=[truths[index], *(column[index][0] for column in columns)],
-                errors=[column[index][1] for column in columns],
-                notes=[caption, *(f"head crop {value:.2f} dB" for value in figures)],
-            )
+            {
+                "names": ["Truth", *(run.label for run in runs)],
+                "pictures": [truths[index], *(column[index][0] for column in columns)],
+                "errors": [column[index][1] for column in columns],
+                "notes": [caption, *(f"head crop {value:.2f} dB" for value in figures)],
+            }
         )
     return drawn
 
 
 def _drawn(experiment: Experiment, frame: Frame, box: Box) -> tuple[Picture, Picture]:
     """A rendering and its error, cut to a box."""
-    image, truth = avatar_image(experiment, frame), target_image(experiment, frame)
-    cut = crop_to(image, box)
-    errors = error_heat(cut, crop_to(truth, box))
+    cut = crop_to(avatar_image(experiment, frame), box)
+    errors = error_heat(cut, crop_to(target_image(experiment, frame), box))
     return picture_of(to_uint8(cut), "rendering", _PICTURE_SIZE), picture_of(errors, "error", _PICTURE_SIZE)
-
-
-def _truth(experiment: Experiment, frame: Frame, box: Box) -> Picture:
-    return picture_of(to_uint8(crop_to(target_image(experiment, frame), box)), "truth", _PICTURE_SIZE)

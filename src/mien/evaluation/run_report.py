@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -11,24 +11,20 @@ from typing import Any
 import numpy as np
 
 from mien.disk.files import write_atomically
+from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, Living
 from mien.evaluation.metrics_file import BASELINE_NAMES, FITTED_NAME, OVER_DARK_NAME, PART_NAMES, PROTOCOL_NAMES, figure
-from mien.evaluation.protocols import Evaluation
-from mien.evaluation.report import report_sections as sections
-from mien.evaluation.report.page import (
-    FITTED_GLOSSARY,
-    GLOSSARY,
+from mien.evaluation.page_parts import (
     Cell,
     DataTable,
-    ReportVideo,
     Video,
-    figure_text,
+    metric_cells,
     metric_groups,
     metric_headings,
 )
-from mien.pages.metric_names import COLUMNS
-from mien.pages.pages import LIVING_PAGE, render
+from mien.evaluation.protocols import Evaluation
+from mien.pages.pages import COLUMNS, LIVING_PAGE, render
 from mien.training.footage.coverage import Coverage
 
 _ROWS = {
@@ -59,26 +55,19 @@ def write_report(
     run: RunRecord,
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
-    videos: Mapping[str, ReportVideo] = MappingProxyType({}),
-    driven: sections.CrossSection | None = None,
+    videos: Mapping[str, Video] = MappingProxyType({}),
+    driven: Mapping[str, Any] | None = None,
     alive: Living | None = None,
 ) -> None:
     """Write the page of a run.
 
-    Args:
-        path: The .html file.
-        run: The run's own record.
-        protocols: `protocols` of metrics.json.
-        results: The experiment and every frame's figures, by protocol.
-        videos: Side-by-side videos by protocol, in or below the page's folder.
-        driven: The section on cross-reenactment.
-        alive: The avatar whose film lies beside the page.
+    `protocols` is that of metrics.json, and `driven` the section on cross-reenactment
+    (`report_sections.cross_section`). The film of `alive` lies beside the page.
     """
     first = next(iter(results.values()), None)
     hero = sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None
-    shown = {name: video.on_page(path.parent) for name, video in videos.items()}
     page = f"../../{LIVING_PAGE}" if (path.parent / "../.." / LIVING_PAGE).is_file() else None
-    text = report_html(run, protocols, results, shown, driven, hero, page)
+    text = report_html(run, protocols, results, videos, driven, hero, page)
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
@@ -87,12 +76,13 @@ def report_html(
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
     videos: Mapping[str, Video] = MappingProxyType({}),
-    driven: sections.CrossSection | None = None,
-    hero: sections.Hero | None = None,
+    driven: Mapping[str, Any] | None = None,
+    hero: Mapping[str, Any] | None = None,
     page: str | None = None,
 ) -> str:
     """The page as text. `videos` holds a video by protocol, and `page` is the address of the living avatar's page."""
-    command_line = _shortened(run.config["command_line"])
+    command_line = list(run.config["command_line"])
+    command_line[:1] = [Path(program).name for program in command_line[:1]]  # without the folder of the program
     first = next(iter(results.values()), None)
     shown = [
         {
@@ -104,6 +94,7 @@ def report_html(
         }
         for name, (experiment, evaluation) in results.items()
     ]
+    backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
     return render(
         "evaluation/templates/report.html",
         title=f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}",
@@ -114,7 +105,8 @@ def report_html(
         page=page,
         tiles=_tiles(run, protocols),
         tables=_tables(protocols),
-        glossary=_glossary(protocols),
+        fitted=any("fitted" in entry for entry in protocols.values()),
+        backbones=", ".join(sorted(backbones)) or "not computed",
         protocols=shown,
         driven=driven,
         training=sections.training_curves(run.curves),
@@ -123,11 +115,6 @@ def report_html(
         memory=f"{run.summary['peak_memory_mb']:,.0f}",
         config=json.dumps({**run.config, "command_line": command_line}, indent=1),
     )
-
-
-def _shortened(command_line: Sequence[str]) -> list[str]:
-    """The command as typed, without the folder of the program."""
-    return [Path(command_line[0]).name, *command_line[1:]] if command_line else []
 
 
 def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -178,42 +165,20 @@ def _parts_table(subjects: Mapping[str, Any], parts: Sequence[str]) -> DataTable
     groups = [Cell(PART_NAMES[part], "group head", len(COLUMNS)) for part in parts]
     head = [[Cell("", "blank"), *groups], [Cell(""), *metric_headings(len(parts))]]
     shown = [key for key in _ROWS if key in subjects and any(part in subjects[key] for part in parts)]
-    rows = [[Cell(_ROWS[key]), *_part_cells(subjects[key], parts)] for key in shown]
+    rows = [[Cell(_ROWS[key]), *metric_cells(subjects[key], parts)] for key in shown]
     return DataTable(head, rows, "Crops of eyes and mouth, in the frames that show them", own=True)
-
-
-def _part_cells(entry: Mapping[str, Any], parts: Sequence[str]) -> list[Cell]:
-    cells = []
-    for part in parts:
-        for index, (metric, _, digits, _) in enumerate(COLUMNS):
-            value = figure(entry, part, metric) if part in entry else None
-            cells.append(Cell(figure_text(value, digits), "head" if index == 0 else ""))
-    return cells
 
 
 def _cells(key: str, subjects: Mapping[str, Any]) -> list[Cell]:
     """One row's figures. The avatar's PSNR includes its lead over the better baseline."""
-    cells = []
-    for part in (None, "head"):
-        for index, (metric, _, digits, _) in enumerate(COLUMNS):
-            value = figure(subjects[key], part, metric)
-            others = [figure(entry, part, metric) for name, entry in subjects.items() if name in BASELINE_NAMES]
-            known = [other for other in others if other is not None]
-            lead = ""
-            if key == "avatar" and metric == "psnr" and value is not None and known:
-                lead = f"{value - max(known):+.1f}"
-            cells.append(Cell(figure_text(value, digits), "head" if part and index == 0 else "", lead=lead))
+    cells = metric_cells(subjects[key], (None, "head"))
+    for place, part in ((0, None), (len(COLUMNS), "head")) if key == "avatar" else ():
+        value = figure(subjects[key], part, "psnr")
+        others = [figure(entry, part, "psnr") for name, entry in subjects.items() if name in BASELINE_NAMES]
+        known = [other for other in others if other is not None]
+        if value is not None and known:
+            cells[place] = replace(cells[place], lead=f"{value - max(known):+.1f}")
     return cells
-
-
-def _glossary(protocols: Mapping[str, Any]) -> dict[str, str]:
-    backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
-    fitted = FITTED_GLOSSARY if any("fitted" in entry for entry in protocols.values()) else {}
-    return {
-        **GLOSSARY,
-        **fitted,
-        "ST-LPIPS": f"{GLOSSARY['ST-LPIPS']} Here: {', '.join(sorted(backbones)) or 'not computed'}.",
-    }
 
 
 def _duration(seconds: float) -> str:

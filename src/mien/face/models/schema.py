@@ -1,0 +1,112 @@
+"""What readers of face models share: checks of a user's arrays, and tensors for a `FaceModel`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from mien.errors import UserError
+from mien.face.model import JOINTS
+
+LARGEST_COEFFICIENT = 3.0  # bound of an expression coefficient in standard deviations, as FLAME and GNM have them
+IRIS_RADIUS = 0.0061  # radius of the iris in metres. Anatomy: it hardly differs between people
+_MIN_HEIGHT, _MAX_HEIGHT = 0.1, 0.6  # range of the height of a head with its neck, in metres
+_MAX_NUMBER = 1e6  # bound of all numbers in a file: metres, weights and indices
+
+
+def check_arrays(
+    path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, str], missing: str, remedy: str
+) -> dict[str, int]:
+    """Check shapes and numbers of arrays, and return the sizes that the letters stand for.
+
+    `shapes` are such as "v 3": a letter is the same size wherever it stands. `missing` is said of an array that is
+    missing.
+    """
+    sizes: dict[str, int] = {}
+    for key in shapes:
+        if key not in arrays:
+            raise UserError(f"{path}: has no {key!r}, so {missing}")
+    for key, shape in shapes.items():
+        array, symbols = arrays[key], shape.split()
+        fits = array.ndim == len(symbols) and array.dtype.kind in "iuf"
+        for size, symbol in zip(array.shape, symbols, strict=False):
+            fits = fits and size > 0 and size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size))
+        if not fits:
+            known = " ".join(str(sizes.get(symbol, symbol)) for symbol in symbols)
+            raise UserError(
+                f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but should be numbers "
+                f"[{known}]; {remedy}"
+            )
+        check_numbers(path, key, array)
+    return sizes
+
+
+def check_numbers(path: Path, key: str, array: np.ndarray) -> None:
+    """Check that the numbers of an array are finite and moderate."""
+    if array.dtype.kind != "f":
+        return
+    if not np.isfinite(array).all():
+        raise UserError(f"{path}: {key!r} holds numbers that are not finite; download it again")
+    largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
+    if largest > _MAX_NUMBER:
+        raise UserError(
+            f"{path}: {key!r} holds {largest:g}, but a head has no number above {_MAX_NUMBER:g}; download it again"
+        )
+
+
+def check_indices(path: Path, key: str, values: np.ndarray, count: int) -> np.ndarray:
+    """Return indices as int64, after a check that each is below `count`."""
+    values = values.astype(np.int64)
+    if values.min() < 0 or values.max() >= count:
+        raise UserError(
+            f"{path}: {key!r} has the index {values.max()}, but only {count} entries exist; download it again"
+        )
+    return values
+
+
+def check_head(
+    path: Path, names: tuple[str, str], template: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, "v k"]
+) -> None:
+    """Check what shapes do not show: the unit of the template, and that weights add up. `names` are theirs."""
+    height = float(np.ptp(template[:, 1]))
+    if not _MIN_HEIGHT < height < _MAX_HEIGHT:
+        raise UserError(
+            f"{path}: {names[0]!r} is {height:g} high, but a head in metres with y upwards is {_MIN_HEIGHT:g} to "
+            f"{_MAX_HEIGHT:g} high: scale it together with its bases, or download it again"
+        )
+    if not np.allclose(weights.sum(1), 1, atol=1e-3) or weights.min() < -1e-6:
+        raise UserError(f"{path}: {names[1]!r} of a vertex do not add up to 1 or are negative; download it again")
+
+
+def float_tensor(values: np.ndarray) -> torch.Tensor:
+    """Return values as float32."""
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+
+def rounded(values: np.ndarray, quantum: float = 1e-7) -> torch.Tensor:
+    """Round computed values, in metres. Their last digits depend on the machine and would change the content hash."""
+    # Adding 0 turns -0 into 0, whose bytes differ.
+    return float_tensor(np.round(values / quantum) * quantum + 0.0)
+
+
+def in_iris(template: Float[np.ndarray, "v 3"], center: Float[np.ndarray, " 3"]) -> Bool[np.ndarray, " v"]:
+    """Return which vertices are on the iris of the eyeball with this centre, which looks ahead, or before it."""
+    rays = template - center
+    return (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < IRIS_RADIUS)
+
+
+def jaw_basis(names: tuple[str, ...], motions: Mapping[str, np.ndarray]) -> Float[np.ndarray, "e k 3"]:
+    """Return the motions of `JOINTS` by each expression, of which only the jaw's are not 0."""
+    basis = np.zeros((len(names), len(JOINTS), 3))
+    for name, motion in motions.items():
+        basis[names.index(name), JOINTS.index("jaw")] = motion
+    return basis
+
+
+def neck_weights(along: Float[np.ndarray, " v"], planes: tuple[float, float]) -> Float[np.ndarray, " v"]:
+    """Return weights that rise smoothly from 0 at the first value to 1 at the second, which is lower."""
+    top, bottom = planes
+    t = np.clip((top - along) / (top - bottom), 0, 1)
+    return t * t * (3 - 2 * t)
