@@ -273,7 +273,7 @@ def test_tracking_looks_at_a_bounded_number_of_frames_at_once(monkeypatch: pytes
 
         monkeypatch.setattr(LandmarkModel, name, watched)
     monkeypatch.setattr(term, "PROJECTED", 16)
-    monkeypatch.setattr(term, "CHUNK", 14)
+    monkeypatch.setattr(term, "LINEARIZED", 14)
     monkeypatch.setattr(stages, "FRAMES_AT_ONCE", 18)
     monkeypatch.setattr(solver, "SEGMENT", 5)
     found = track(case.capture, model)

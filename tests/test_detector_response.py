@@ -12,7 +12,7 @@ from mien.lab.synthetic.detector_calibration import Sightings, fit_response
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.parameters import layout_of
-from mien.tracking.fitting.shot import without_flicker
+from mien.tracking.fitting.sequence import without_flicker
 from mien.tracking.fitting.views import CameraBatch, Views, batch_of
 from mien.tracking.landmarks.detector_response import DetectorResponse, read_response, unknown_response, write_response
 from mien.tracking.landmarks.model import reduce_face_model

@@ -18,16 +18,16 @@ from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.render.mesh import rasterize_mesh
 from mien.tracking import read_tracking, write_tracking
-from mien.tracking.eyelids.eyes import eyes_of
-from mien.tracking.eyelids.placing import place_lids, weigh_positions
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.parameters import layout_of
-from mien.tracking.fitting.shot import Shot, shot_of
+from mien.tracking.fitting.sequence import SequenceData, sequence_data
 from mien.tracking.fitting.views import CameraBatch, Views, batch_of
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, RIGHT_EYELIDS
 from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
 from mien.tracking.landmarks.term import unknown_subject
 from mien.tracking.pixels.covered import covered_parts, the_face, usual_look
+from mien.tracking.pixels.eyelids import place_lids, weigh_positions
+from mien.tracking.pixels.eyes import eyes_of
 from mien.tracking.report.page import findings
 from mien.tracking.report.residuals import residual_report
 from mien.tracking.settings import TrackingSettings
@@ -60,7 +60,7 @@ class BlinkCase:
         state[:, self.columns] = torch.from_numpy(lids)
         return state
 
-    def shot(self, lids: np.ndarray, size: int = 192, white: tuple[float, float, float] = WHITE) -> Shot:
+    def shot(self, lids: np.ndarray, size: int = 192, white: tuple[float, float, float] = WHITE) -> SequenceData:
         """Return a clip in which the lids are as given. `white` is the colour of the eyeballs."""
         camera = _camera(size)
         face = self.reduced.layout.face_params(self.states(lids), unknown_subject(self.reduced).identity)
@@ -71,7 +71,7 @@ class BlinkCase:
             capture_of(marks), images=images[:, None], mattes=np.full((len(lids), 1, size, size), 255, np.uint8),
             principal_point=np.full((1, 2), size / 2, np.float32),
         )  # fmt: skip
-        return shot_of(capture, TrackingSettings())
+        return sequence_data(capture, TrackingSettings())
 
     def fit(self, lids: np.ndarray, size: int = 192) -> Fit:
         own = SequenceFit(batch_of((_camera(size),)), self.states(lids))
@@ -176,7 +176,7 @@ BLINKS[16, 1] = 1.0
 blinking = pytest.fixture(scope="module")(lambda case: case.shot(BLINKS))
 
 
-def place(case: BlinkCase, shot: Shot, tracked: np.ndarray) -> np.ndarray:
+def place(case: BlinkCase, shot: SequenceData, tracked: np.ndarray) -> np.ndarray:
     """Return the lids that are placed, after a look that nothing but lids has moved."""
     before = case.fit(tracked)
     after = place_lids(case.reduced, [shot], before, 1.0)

@@ -156,7 +156,7 @@ def test_a_small_capture_is_tracked(model: FaceModel) -> None:
         landmarks=camera.project(_as_detected(model, face).float())[0].numpy()[:, None], valid=np.ones((8, 1), bool),
         principal_point=np.full((1, 2), 128, np.float32), source={},
     )  # fmt: skip
-    pixel_fit = PhotometricSettings(sizes=(128,), texture_size=64, texture_frames=8, shared_steps=1, keyframes=4)
+    pixel_fit = PhotometricSettings(sizes=(128,), texture_size=64, shared_steps=1, keyframes=4)
     tracking = track(capture, model, TrackingSettings(focal=390.0, keyframes=8, photometric=pixel_fit))
     assert tracking.pixel_residuals is not None
     assert tracking.residuals.nanmedian() < 0.5

@@ -182,7 +182,7 @@ def test_a_point_on_the_surface_is_found_again():
     targets[5] = targets[5] + 200
     views = DetectedViews(torch.stack(pixels), torch.stack(depths), torch.stack(targets))
     for landmark in range(len(truth)):
-        triangle, barycentric, error = best_point(views, model.faces, allowed, landmark, clamp=10.0)
+        triangle, barycentric, error = best_point(views, model.faces, allowed, landmark)
         found = barycentric @ model.template[model.faces[triangle]]
         torch.testing.assert_close(found, points[landmark], atol=1e-6, rtol=0)
         assert error < 1e-2

@@ -26,7 +26,8 @@ from mien.evaluation.experiment import Frame
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import EvaluationSettings
 from mien.face.loading import read_landmarks
-from mien.tracking import pipeline, read_tracking, track_subject
+from mien.tracking import read_tracking, track_subject
+from mien.tracking.pipeline import track as pipeline
 from mien.tracking.scoring_files import read_scoring
 from mien.tracking.settings import TrackingSettings
 from mien.training import read_sequence, trainer

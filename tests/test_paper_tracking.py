@@ -9,17 +9,18 @@ import torch
 
 from mien.adam import Moments
 from mien.tracking import track, track_subject
-from mien.tracking.descent import epochs, frames
-from mien.tracking.descent.adam import apply_adam
-from mien.tracking.descent.epochs import Descent
+from mien.tracking.descent import epochs, terms
+from mien.tracking.descent import fit as frames
+from mien.tracking.descent.epochs import Descent, apply_adam
 from mien.tracking.descent.scene import first_state, paper_scene
 from mien.tracking.descent.terms import landmark_terms, prior_term, read_target
 from mien.tracking.fitting import resume
 from mien.tracking.fitting.fit import Fit, SequenceFit, widen
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.resume import StageCache
-from mien.tracking.fitting.shot import lenses_of, shot_of
+from mien.tracking.fitting.sequence import sequence_data
 from mien.tracking.landmarks.model import reduce_face_model
+from mien.tracking.landmarks.problem import Problem, lenses_of
 from mien.tracking.landmarks.term import all_landmarks, quiet_landmarks, unknown_subject
 from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
 from photometric_case import FOCAL, PhotometricCase, assert_alike, make_photometric_case
@@ -37,18 +38,19 @@ case = pytest.fixture(scope="module")(lambda: make_photometric_case(timesteps=8)
 
 def scene_of(case: PhotometricCase, settings: TrackingSettings, **response: torch.Tensor):
     """Return the scene at the true pose, with the fit, the shot and the model that it is of."""
-    shot, layout = shot_of(case.capture, settings), layout_of(case.model)
+    shot, layout = sequence_data(case.capture, settings), layout_of(case.model)
     model = reduce_face_model(case.model, layout)
     model = reduce_face_model(case.model, layout, replace(model.response, **response))
     state = torch.cat([case.face.head_rotation, case.face.head_translation], dim=1).double()
     fit = Fit(unknown_subject(model), (SequenceFit(shot.cameras, widen(state, layout)),))
-    return paper_scene(model, [shot], lenses_of([case.capture], settings), fit, settings), fit, shot, model
+    problem = Problem(model, [shot], lenses_of([case.capture], settings), settings)
+    return paper_scene(problem, fit), fit, shot, model
 
 
 def _descent(case: PhotometricCase, settings: TrackingSettings) -> Descent:
     """The state before any step."""
     scene, fit, *_ = scene_of(case, settings)
-    descent = Descent(scene, first_state(scene, fit, [None]))
+    descent = Descent(scene, first_state(scene, fit))
     descent.state.visibility += 1
     return descent
 
@@ -112,7 +114,7 @@ def test_every_camera_of_a_timestep_counts_in_every_step(case):
 
 
 def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
-    settings = replace(PAPER, paper=replace(QUICK, first_steps=2, steps=1, texture_steps=1))
+    settings = replace(PAPER, paper=replace(QUICK, first_steps=2, steps=1))
     descent, counts = _descent(case, settings), []
     frame_cost = Descent.frame_cost
 
@@ -136,7 +138,7 @@ def test_smoothness_in_the_frame_pass_is_a_setting(case):
     for smoothness in (0.0, 1.0):
         descent = _descent(case, replace(PAPER, paper=replace(QUICK, pass_smoothness=smoothness)))
         rows = descent.state.frames[0]
-        rows[3] = descent.within(rows[3] + 0.02)
+        rows[3] = descent.bounds.clip(rows[3] + 0.02)
         frames.fit_row(descent, descent.targets(0, 3), 10)
         ends[smoothness] = rows[3].clone()
     steady = (_descent(case, LANDMARKS).state.frames[0][[2, 4]]).mean(0)
@@ -167,15 +169,16 @@ def test_the_same_with_any_number_of_threads(monkeypatch):
     assert_alike(*runs)
 
 
-def test_landmarks_cost_what_they_cost_other_schedules(case):
+def test_landmarks_cost_what_they_cost_other_schedules(case, monkeypatch):
     """The detector's whole response counts, with turns and expressions."""
-    settings = replace(PAPER, paper=replace(QUICK, gap_weight=0.0))
-    random, plain = torch.Generator().manual_seed(0), scene_of(case, settings)[3].response
+    monkeypatch.setattr(terms, "_gaps", lambda *_: torch.zeros(1))
+    settings, random = PAPER, torch.Generator().manual_seed(0)
+    plain = scene_of(case, settings)[3].response
     scene, fit, shot, model = scene_of(case, settings, **{
         name: 0.01 * torch.randn(getattr(plain, name).shape, generator=random, dtype=torch.float64)
         for name in ("by_turn", "by_expression")
     })  # fmt: skip
-    descent, (own,) = Descent(scene, first_state(scene, fit, [None])), fit.sequences
+    descent, (own,) = Descent(scene, first_state(scene, fit)), fit.sequences
     target = read_target(scene, 0, 3, 0)
     term = quiet_landmarks(all_landmarks(model, shot.views, own, settings), settings.paper.landmark_share)
     expected = term.cost(own.state, fit.subject, own.cameras)[3]

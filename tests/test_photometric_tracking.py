@@ -21,8 +21,8 @@ from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.shared import move_like_keyframes
 from mien.tracking.pixels.surface import PosedSurface, surface_model
 from mien.tracking.pixels.texture import (
-    Sighting,
     SkinTexture,
+    SurfaceView,
     estimate_appearance,
     even_light,
     texture_space,
@@ -225,7 +225,7 @@ def drawn(surface: PosedSurface, skin: SkinTexture, light: Tensor) -> tuple[Tens
     return image, (alpha > 0.99).float()
 
 
-def reference(seen: Sighting, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def reference(seen: SurfaceView, skin: SkinTexture) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return cost, half gradient, half Hessian and residuals by PyTorch in float64, without a high-pass filter."""
     vertices, normals = seen.posed.vertices, seen.posed.normals
     fragments = rasterize_mesh(vertices, MODEL.faces, CAMERA)
@@ -270,7 +270,7 @@ def test_cost_gradient_and_hessian_are_those_of_the_pixels():
     mask = torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(4)).clamp_min(0.2)
     mask[:, :20] = 0
     jacobian = torch.randn(len(MODEL.template), 3, 5, generator=torch.Generator().manual_seed(2))
-    seen = Sighting(posed(jacobian=jacobian), Picture(CAMERA, smooth_noise(SIDE, SIDE, 2.0, 5), mask), LIGHT)
+    seen = SurfaceView(posed(jacobian=jacobian), Picture(CAMERA, smooth_noise(SIDE, SIDE, 2.0, 5), mask), LIGHT)
     gradient, hessian, residual = torch.empty(5), torch.empty(5, 5), torch.empty(SIDE, SIDE, 3)
     surface = _native.AlignSurface(
         SPACE.faces, SPACE.corners, SPACE.used.to(torch.uint8), SKIN.albedo, SKIN.trust, SIGMA, OUTLIER, LEAST_COSINE
@@ -289,29 +289,29 @@ def test_high_pass_leaves_out_a_smooth_light_but_not_texture():
     (image, mask), surface = drawn(posed(), SKIN, even_light()), SPACE.native(SKIN, 5.0)
     ramp = torch.linspace(0.0, 0.3, SIDE)[None, :, None]
     for picture, least, most in ((image + ramp, 0, 0.05), (image.roll(3, dims=1), 0.3, 9)):
-        seen = Sighting(posed(), Picture(CAMERA, picture.contiguous(), mask), even_light()).arrays()
+        seen = SurfaceView(posed(), Picture(CAMERA, picture.contiguous(), mask), even_light()).arrays()
         plain, high_passed = (_native.align_mesh(surface, seen, r, None, None, None)[0] for r in (0, 6))
         assert least * plain < high_passed < most * plain
 
 
-def _pictures_under_light(light: Tensor) -> list[Sighting]:
+def _pictures_under_light(light: Tensor) -> list[SurfaceView]:
     surfaces = [posed((0.0, 0.0, -0.5), yaw) for yaw in (0.0, 0.7, -0.7, 0.35, -0.35)]
     pictures = [drawn(surface, SKIN, light) for surface in surfaces]
-    return [Sighting(surface, Picture(CAMERA, image.contiguous(), mask), even_light())
+    return [SurfaceView(surface, Picture(CAMERA, image.contiguous(), mask), even_light())
             for surface, (image, mask) in zip(surfaces, pictures, strict=True)]  # fmt: skip
 
 
 def test_albedo_times_light_gives_the_pictures_back():
-    sightings = _pictures_under_light(LIGHT)
-    found, (light,) = estimate_appearance(SPACE, [sightings], unknown_texture(SPACE), 3.0, 0)
+    views = _pictures_under_light(LIGHT)
+    found, (light,) = estimate_appearance(SPACE, [views], unknown_texture(128), 3.0, 0)
     surface = SPACE.native(found, 5.0)
-    for seen in sightings:
+    for seen in views:
         residual = torch.empty(SIDE, SIDE, 3)
-        _native.align_mesh(surface, Sighting(seen.posed, seen.picture, light).arrays(), 0, None, residual, None)
+        _native.align_mesh(surface, SurfaceView(seen.posed, seen.picture, light).arrays(), 0, None, residual, None)
         known = residual[~residual.isnan().any(-1)]
         assert len(known) > 300
         assert known.abs().median() < 0.01
-    found, _ = estimate_appearance(SPACE, [_pictures_under_light(even_light())], unknown_texture(SPACE), 3.0, 0)
+    found, _ = estimate_appearance(SPACE, [_pictures_under_light(even_light())], unknown_texture(128), 3.0, 0)
     behind = SPACE.fragments.face_index[:, 64:] >= 0
     assert float(found.trust[:, 64:][behind].mean()) < 0.2
     assert float(found.trust[48:80, 24:40].min()) > 0.5

@@ -12,7 +12,7 @@ from mien.face import FaceModel, FaceParams, load_face_model
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle, rigid_transform
 from mien.tracking import read_tracking, track, track_subject
 from mien.tracking import write_tracking as write
-from mien.tracking.fitting.shot import initial_camera
+from mien.tracking.fitting.sequence import initial_camera
 from mien.tracking.landmarks.groups import landmark_weights
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.report.residuals import residual_report

@@ -19,16 +19,15 @@ from mien.capture.capture import Capture
 from mien.cli import main
 from mien.pipeline import track as stage
 from mien.tracking import read_tracking, track, track_subject
-from mien.tracking.fitting.fit import Fit, Subject
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.resume import StageCache
-from mien.tracking.fitting.shot import shot_of
-from mien.tracking.held_out import mean_light
+from mien.tracking.fitting.sequence import sequence_data
 from mien.tracking.landmarks import stages
 from mien.tracking.landmarks.model import reduce_face_model
+from mien.tracking.landmarks.problem import Problem
+from mien.tracking.pipeline.held_out import mean_light
 from mien.tracking.pixels import refine
 from mien.tracking.pixels.outcome import turn_light
-from mien.tracking.pixels.texture import PhotometricFit, SkinTexture
 from mien.tracking.report import preview
 from mien.tracking.report.preview import Preview
 from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
@@ -133,18 +132,16 @@ def test_focal_length_and_light_of_what_is_held_out_are_those_of_the_others(case
     assert turn_error(apart, second) < 1.5
     # Sequences of a rig have frames of their own, so a light is turned twice on its way.
     random = torch.Generator().manual_seed(0)
-    shot, straight = shot_of(shaping, LANDMARKS), torch.eye(4, dtype=torch.float64)
+    shot, straight = sequence_data(shaping, LANDMARKS), torch.eye(4, dtype=torch.float64)
     turn = torch.tensor([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
     lights = tuple(torch.randn(9, 3, generator=random) for _ in range(3))
-    nothing = Fit(Subject(torch.zeros(1), torch.zeros(1, 3)), ())
-    shown = PhotometricFit(nothing, SkinTexture(torch.zeros(1, 1, 3), torch.zeros(1, 1), 0.1), lights, ())
     turned, level = replace(shot, T_world_fit=turn), replace(shot, T_world_fit=straight)
     others, to_world = [turned, level, shot], turn[:3, :3].float()
     expected = (turn_light(lights[0], to_world) + lights[1]) / 2
-    torch.testing.assert_close(mean_light(level, others, shown), expected, atol=1e-5, rtol=0)
-    found = turn_light(mean_light(turned, others, shown), to_world)
+    torch.testing.assert_close(mean_light(level, others, lights), expected, atol=1e-5, rtol=0)
+    found = turn_light(mean_light(turned, others, lights), to_world)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
-    assert torch.equal(mean_light(shot, others, shown), lights[2]), "other kinds of sequences do not count"
+    assert torch.equal(mean_light(shot, others, lights), lights[2]), "other kinds of sequences do not count"
 
 
 @pytest.mark.unchecked
@@ -246,7 +243,7 @@ def test_goes_on_from_every_piece(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(refine, "FRAMES_AT_ONCE", 3)
     case, keep = make_photometric_case(timesteps=8), tmp_path / "kept"
     expected = track_subject([case.capture], case.model, UNKNOWN_FOCAL)[0]
-    for piece in ("identity", "frames-0-0", "sequence-0", "step-0-0-equations-1", "round-1-shared-0", "lids"):
+    for piece in ("identity", "frames-0-0", "sequence-0", "step-0-0-equations-1", "iteration-1-shared-0", "lids"):
         before, written = {path.stem for path in keep.glob("*")}, []
         with monkeypatch.context() as patched:
             patched.setattr(StageCache, "write", stops_after(piece, written, interrupt))
@@ -254,11 +251,11 @@ def test_goes_on_from_every_piece(tmp_path, monkeypatch, capsys):
         assert written[-1] == piece
         assert not before & set(written), "what was finished is done again"
         assert ("continues where it was interrupted" in capsys.readouterr().err) == bool(before)
-    for name in ("sequence-1", "round-0"):
+    for name in ("sequence-1", "iteration-0"):
         whole = (keep / f"{name}.safetensors").read_bytes()
         (keep / f"{name}.safetensors").write_bytes(whole[: len(whole) // 2])
     assert_alike(expected, track_subject([case.capture], case.model, UNKNOWN_FOCAL, keep)[0])
-    assert "round-0.safetensors: is damaged, so this part" in capsys.readouterr().err
+    assert "iteration-0.safetensors: is damaged, so this part" in capsys.readouterr().err
     assert not keep.exists()
 
 
@@ -279,7 +276,7 @@ def test_killed_tracking_goes_on(tmp_path, monkeypatch, capsys, fork_server):
         write_capture(tmp_path / name / "sequences/clip/capture", capture)
     assert main(["track", str(tmp_path / "undisturbed"), *command]) == 0
     function, folder = f"{Path(__file__).stem}:track_until_killed", tmp_path / "killed"
-    assert fork_server.call(function, "round-0-looks", str(folder), *command).wait() == -signal.SIGKILL
+    assert fork_server.call(function, "iteration-0-appearance", str(folder), *command).wait() == -signal.SIGKILL
     sequences = folder / "sequences"
     assert not (sequences / "clip/tracking/tracking.json").exists()
     assert len(list(sequences.glob(".tracking-*/*.safetensors"))) >= 5
@@ -311,17 +308,16 @@ SHOWN = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_si
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
-    """Collect stage, progress and height of every picture that is written."""
+    """Collect stage, progress and number of charts of every page that is written."""
     monkeypatch.setattr(preview, "INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr(preview, "MAX_SHARE", 1e9)
-    shown, with_header = [], Preview.with_header
+    shown, render = [], preview.render
 
-    def record(self: Preview, stage: str, progress: float) -> np.ndarray:
-        picture = with_header(self, stage, progress)
-        shown.append((stage, progress, len(picture)))
-        return picture
+    def record(template: str, **content: Any) -> str:
+        shown.append((content["stage"], float(content["done"].split()[0]) / 100, len(content["charts"])))
+        return render(template, **content)
 
-    monkeypatch.setattr(Preview, "with_header", record)
+    monkeypatch.setattr(preview, "render", record)
     return shown
 
 
@@ -332,15 +328,16 @@ def test_every_stage_is_shown_and_changes_nothing(tmp_path, seen):
     found = track_subject([case.capture], case.model, SHOWN, preview=page)[0]
     assert_alike(track_subject([case.capture], case.model, SHOWN)[0], found)
     stages = [stage for stage, _, _ in seen]
-    assert {"landmarks, identity", "landmarks, sequence", "pixels, round 1 of 2, texture and light",
-            "pixels, round 2 of 2, identity", "pixels, round 2 of 2, frames", "done"} <= set(stages)  # fmt: skip
+    assert {"landmarks, identity", "landmarks, sequence", "pixels, iteration 1 of 2, texture and light",
+            "pixels, iteration 2 of 2, identity", "pixels, iteration 2 of 2, frames",
+            "done"} <= set(stages)  # fmt: skip
     for name in ("landmarks", "pixels"):
         progress = [part for stage, part, _ in seen if stage.startswith(name)]
         assert (progress, progress[-1]) == (sorted(progress), pytest.approx(1.0))
-    heights = [height for _, _, height in seen]
-    assert heights[0] < heights[stages.index("landmarks, identity")] < heights[-1], "residuals of colours are missing"
+    counts = [count for _, _, count in seen]
+    assert (counts[0], counts[stages.index("landmarks, identity")], counts[-1]) == (0, 1, 2)
     assert "refresh" not in page.read_text(), "the last one is not renewed"
-    assert "data:image/png" in page.read_text()
+    assert page.read_text().count("data:image/jpeg") == 4 * 4
 
 
 @pytest.mark.unchecked
@@ -357,7 +354,7 @@ def watch_of(folder: Path) -> Preview:
     case = make_photometric_case(timesteps=3)
     with torch.no_grad():
         reduced = reduce_face_model(case.model, layout_of(case.model))
-    return Preview(folder / "p.html", case.model, reduced, [shot_of(case.capture, SHOWN)], SHOWN)
+    return Preview(folder / "p.html", case.model, Problem(reduced, [sequence_data(case.capture, SHOWN)], [None], SHOWN))
 
 
 @pytest.mark.unchecked
@@ -366,13 +363,12 @@ def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
     now, drawn, written = [0.0], [], []
     monkeypatch.setattr(preview.time, "monotonic", lambda: now[0])
 
-    def draw(self: Preview, fit: object) -> np.ndarray:
+    def draw(self: Preview, fit: object) -> None:
         now[0] += 1.0
         drawn.append(fit)
-        return np.zeros((10, 960, 3), np.uint8)
 
     monkeypatch.setattr(Preview, "draw", draw)
-    monkeypatch.setattr(Preview, "write", lambda self, picture, last: written.append((now[0], last)))
+    monkeypatch.setattr(Preview, "write", lambda self, stage, progress: written.append(stage == "done"))
     watch = watch_of(tmp_path)
     for second in range(40):
         now[0] = max(now[0], float(second))
@@ -382,7 +378,7 @@ def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
     assert len(drawn) == 4
     watch("done", 1.0)
     assert drawn[-1] == 39, "what came last is not shown at the end"
-    assert [last for _, last in written] == [False] * 4 + [True]
+    assert written == [False] * 4 + [True]
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])

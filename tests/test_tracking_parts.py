@@ -7,7 +7,7 @@ import torch
 
 from mien.tracking.fitting.fit import Fit, SequenceFit, Subject, smoothness_of
 from mien.tracking.fitting.parameters import layout_of
-from mien.tracking.fitting.shot import shot_of
+from mien.tracking.fitting.sequence import sequence_data
 from mien.tracking.fitting.solver import (
     Bounds,
     NormalEquations,
@@ -20,10 +20,9 @@ from mien.tracking.fitting.solver import (
 from mien.tracking.fitting.views import batch_of
 from mien.tracking.landmarks import groups
 from mien.tracking.landmarks.model import reduce_face_model
-from mien.tracking.landmarks.outcome import fill_gaps
+from mien.tracking.landmarks.outcome import fill_gaps, without_turn_habits
 from mien.tracking.landmarks.shared_fit import joint_cost, precision_of_shared
 from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
-from mien.tracking.landmarks.turn_habits import without_turn_habits
 from mien.tracking.settings import SmoothnessSettings, TrackingSettings
 from small_face_model import make_small_face_model
 from tracking_case import make_tracking_case, still_camera
@@ -166,7 +165,7 @@ def test_landmark_groups_are_mediapipes():
 def case() -> tuple[LandmarkTerm, SequenceFit, Subject]:
     """Return a term over five timesteps, away from its minimum and from its prior's."""
     made = make_tracking_case(timesteps=5)
-    shot = shot_of(made.capture, TrackingSettings())
+    shot = sequence_data(made.capture, TrackingSettings())
     reduced = reduce_face_model(made.model, layout_of(made.model))
     state = 0.05 * torch.randn(5, reduced.layout.size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     state[:, 5] -= 0.9
@@ -220,7 +219,7 @@ def term() -> LandmarkTerm:
     shares = torch.ones(len(case.model.expression_basis), 1, 1, dtype=torch.float64)
     shares[0], shares[FAINT - PLAIN] = 3, 0.01
     model = replace(case.model, expression_basis=shares * case.model.expression_basis)
-    shot = shot_of(case.capture, TrackingSettings())
+    shot = sequence_data(case.capture, TrackingSettings())
     reduced = reduce_face_model(model, layout_of(model))
     state = torch.zeros(60, reduced.layout.size, dtype=torch.float64)
     state[:, 5] -= 0.9

@@ -19,15 +19,14 @@ from mien.media.video import probe_video
 from mien.render.mesh import shade
 from mien.rotation import invert_rigid, matrix_from_axis_angle
 from mien.tracking import track
-from mien.tracking.pixels.comparison import model_pictures, window_of
-from mien.tracking.pixels.outcome import appearance_in_world, turn_light
+from mien.tracking.pixels.outcome import appearance_in_world, model_pictures, turn_light
+from mien.tracking.pixels.pictures import window_of
 from mien.tracking.pixels.texture import SkinTexture, even_light
 from mien.tracking.report import overlay
-from mien.tracking.report.contact_sheet import sheet_frames, sheet_rows, worst_of_runs
-from mien.tracking.report.heat import heat_map
-from mien.tracking.report.overlay import OverlayPainter, overlay_stride, write_overlay
-from mien.tracking.report.page import findings, name_runs
-from mien.tracking.report.residuals import residual_report, write_residual_report
+from mien.tracking.report.contact_sheet import name_of, sheet_frames, tiles_of, worst_of_runs
+from mien.tracking.report.overlay import OverlayPainter, heat_map, overlay_stride, write_overlay
+from mien.tracking.report.page import findings, name_runs, write_residual_report
+from mien.tracking.report.residuals import residual_report
 from mien.tracking.report.rig import seen_from_front, visible_landmarks
 from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
 from mien.tracking.tracking import Appearance, Tracking
@@ -81,7 +80,7 @@ def test_turned_light_falls_on_turned_normals_alike():
     T_world_fit[:3, :3] = R_world_fit = matrix_from_axis_angle(torch.tensor([0.4, -1.0, 0.3]))
     turned = turn_light(light, R_world_fit)
     torch.testing.assert_close(shade(normals @ R_world_fit.T, turned), shade(normals, light), atol=1e-5, rtol=0)
-    appearance = appearance_in_world(SkinTexture(torch.zeros(2, 2, 3), torch.ones(2, 2), 0.1), light, T_world_fit, 0.01)
+    appearance = appearance_in_world(SkinTexture(torch.zeros(2, 2, 3), torch.ones(2, 2), 0.1), light, T_world_fit)
     torch.testing.assert_close(appearance.light, turned, atol=1e-5, rtol=0)
 
 
@@ -123,9 +122,11 @@ def test_the_sheet_has_what_stands_out(case, truth):
     odd = replace(truth, pixel_residuals=residuals)
     frames = sheet_frames(odd, flagged=[3, 4], alone=[1])
     assert [frame.timestep for frame in frames] == sorted({frame.timestep for frame in frames})
-    rows = sheet_rows(case.capture, odd, case.model, frames)
-    assert [row.name for row in rows if row.odd] == ["Frame 1, landmarks only", "Frame 4, flagged"]
-    assert {tuple(tile.shape for tile in row.tiles) for row in rows} == {((240, 240, 3),) * 4}
+    assert [name_of(case.capture, frame) for frame in frames if frame.why] == [
+        "Frame 1, landmarks only", "Frame 4, flagged"
+    ]  # fmt: skip
+    painter = OverlayPainter(case.capture, odd, case.model)
+    assert [tile.shape for tile in tiles_of(painter, case.capture, frames[0])] == [(240, 240, 3)] * 4
     assert worst_of_runs([2, 3, 7], np.array([0, 0, 1, 5, 0, 0, 0, 3.0])) == [3, 7]
     assert name_runs([3, 7, 8, 9, 12]) == "3, 7-9, 12"
 

@@ -265,8 +265,6 @@ def test_masks_keep_their_cut(tmp_path):
         check_scoring_cut(folder, ScoringSettings("plane"), "a1")
     edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
     refuses(r"cut 'circle' is neither plane nor line; delete the folder", read_scoring, folder)
-    edit_json(folder / "scoring.json", lambda content: content.pop("cut"))
-    assert read_scoring(folder).cut == "plane", "masks from before there was a choice"
 
 
 def test_damaged_scoring(tmp_path):

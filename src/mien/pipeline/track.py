@@ -23,10 +23,10 @@ from mien.machine.progress import say
 from mien.media.video import count_frames
 from mien.pipeline.face_models import face_model_of
 from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
-from mien.tracking.fitting.shot import has_enough_faces
-from mien.tracking.pipeline import track_subject
+from mien.tracking.fitting.sequence import has_enough_faces
+from mien.tracking.pipeline.track import track_subject
 from mien.tracking.report.overlay import overlay_stride, write_overlay
-from mien.tracking.report.residuals import write_residual_report
+from mien.tracking.report.page import write_residual_report
 from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import check_scoring_cut, scoring_exists, write_scoring
 from mien.tracking.settings import ScoringSettings, TrackingSettings

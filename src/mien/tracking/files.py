@@ -18,22 +18,25 @@ from mien.tracking.tracking import PARTS, Appearance, Tracking
 
 _FORMAT, _VERSION = "mien.tracking", 1
 _JSON, _TENSORS = "tracking.json", "tracking.safetensors"
+_STAGE = "`mien track`"
+_REMEDY = "delete the folder and run `mien track` again"
 _FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
 _APPEARANCE = ("texture", "trust", "light")
 _OPTIONAL = ("vertex_offsets", "pixel_residuals", "covered", *_APPEARANCE)
+_FLAGS = ("valid", "covered")
 _AXES = {
     "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
     "camera_viewmats": "c44", "pixel_residuals": "tc", "texture": "yx3", "trust": "yx", "light": "93",
     "covered": "tcp",
 }  # fmt: skip
-_STAGE = "`mien track`"
-_REMEDY = "delete the folder and run `mien track` again"
+"""Axes of each tensor. Axes of the same letter have the same size."""
 
 
 def write_tracking(path: Path, tracking: Tracking) -> None:
     """Write a tracking into the folder `path`. The json is written last and holds the hash of the numbers."""
     check_tree(path)
+    appearance, known = tracking.appearance, tracking.residuals[tracking.residuals.isfinite()].double()
     tensors = {
         **tracking.face.tensors(),
         "valid": tracking.valid.to(torch.uint8),
@@ -46,8 +49,8 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
         tensors["pixel_residuals"] = tracking.pixel_residuals
     if tracking.covered is not None:
         tensors["covered"] = tracking.covered.to(torch.uint8)
-    if tracking.appearance is not None:
-        tensors |= {name: getattr(tracking.appearance, name) for name in _APPEARANCE}
+    if appearance is not None:
+        tensors |= {name: getattr(appearance, name) for name in _APPEARANCE}
     write_tensors(path / _TENSORS, tensors)
     content = {
         "face_model": tracking.face_model,
@@ -55,8 +58,11 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
         "timesteps": len(tracking.face),
         "valid_timesteps": int(tracking.valid.sum()),
         "cameras": [{"width": camera.width, "height": camera.height} for camera in tracking.cameras],
-        "residual": _residual_summary(tracking.residuals),
-        "looks": None if tracking.appearance is None else _numbers_of(tracking.appearance),
+        "residual": {
+            "median_px": float(known.median()) if len(known) else None,
+            "p95_px": float(known.quantile(0.95)) if len(known) else None,
+        },
+        "looks": appearance and {"sigma": appearance.sigma, "light_extent": appearance.light_extent},
         "settings": tracking.settings,
         "tensors_sha256": file_digest(path / _TENSORS),
     }
@@ -64,12 +70,7 @@ def write_tracking(path: Path, tracking: Tracking) -> None:
 
 
 def read_tracking(path: Path) -> Tracking:
-    """Read a tracking that `write_tracking` wrote.
-
-    Raises:
-        UserError: A file is missing, damaged, of another version, being written, or a link, or it holds numbers that
-            are not finite or exceed `mien.disk.limits`.
-    """
+    """Read a tracking that `write_tracking` wrote."""
     return read_beside_writers(lambda: _read_tracking(path), [path], [path.parent])
 
 
@@ -79,20 +80,32 @@ def _read_tracking(path: Path) -> Tracking:
     tensors = read_tensors(path / _TENSORS, _STAGE)
     if file_digest(path / _TENSORS) != content.get("tensors_sha256"):
         raise UserError(f"{path / _TENSORS}: does not match {_JSON}; {_REMEDY}")
-    _check_shapes(path, tensors)
+    fault = _fault_of(tensors)
+    if fault:
+        raise UserError(f"{path / _TENSORS}: {fault}; {_REMEDY}")
     with expect_whole(path / _JSON, _REMEDY):
+        appearance = None
+        if content.get("looks") is not None:
+            sigma, extent = (float(content["looks"][name]) for name in ("sigma", "light_extent"))
+            if not (0 <= sigma <= MAX_NUMBER and 0 <= extent <= MAX_NUMBER):
+                raise ValueError(f"sigma {sigma:g} and light_extent {extent:g} are out of range")
+            appearance = Appearance(*(tensors[name] for name in _APPEARANCE), sigma, extent)
+        together = content["settings"].get("tracked_together", [])  # read before a capture is tracked again
+        names = [content["face_model"], content["face_model_hash"], *together]
+        if not isinstance(together, list) or not all(isinstance(name, str) and is_one_line(name) for name in names):
+            raise ValueError(f"{names!r:.40} are not names")
         return Tracking(
-            face_model=_text(content["face_model"]),
-            face_model_hash=_text(content["face_model_hash"]),
+            face_model=content["face_model"],
+            face_model_hash=content["face_model_hash"],
             face=FaceParams(**{name: tensors[name] for name in _FACE if name in tensors}),
             valid=tensors["valid"].bool(),
             cameras=_cameras(content["cameras"], tensors["camera_K"], tensors["camera_viewmats"]),
             neck_lines=tensors["neck_lines"],
             residuals=tensors["residuals"],
             pixel_residuals=tensors.get("pixel_residuals"),
-            appearance=_read_appearance(content.get("looks"), tensors),
+            appearance=appearance,
             covered=tensors["covered"].bool() if "covered" in tensors else None,
-            settings=_read_settings(content["settings"]),
+            settings=dict(content["settings"]),
         )
 
 
@@ -114,63 +127,24 @@ def _cameras(entries: Any, Ks: Tensor, viewmats: Tensor) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def _text(value: object) -> str:
-    if not (isinstance(value, str) and is_one_line(value)):
-        raise ValueError(f"{value!r:.40} is not a name")
-    return value
-
-
-def _read_settings(settings: Any) -> dict[str, Any]:
-    """The settings unchanged. Only `tracked_together` is checked: it is read before a capture is tracked again."""
-    together = settings.get("tracked_together", [])
-    if not (isinstance(together, list) and all(isinstance(name, str) for name in together)):
-        raise ValueError("tracked_together is not a list of names")
-    return dict(settings)
-
-
-def _check_shapes(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Check that no tensor is missing, that axes of the same name agree, and that all numbers are finite."""
+def _fault_of(tensors: dict[str, Tensor]) -> str:
+    """What is wrong with the tensors: missing, of other sizes or types, or not finite; empty if nothing is."""
     sizes: dict[str, int] = {"3": 3, "4": 4, "9": 9, "p": len(PARTS)}
     for name, axes in _AXES.items():
         if name not in tensors:
             if name in _OPTIONAL:
                 continue
-            raise UserError(f"{path / _TENSORS}: lacks {name!r}; {_REMEDY}")
-        shape = tuple(tensors[name].shape)
-        agrees = len(shape) == len(axes) and all(
-            sizes.setdefault(axis, size) == size for axis, size in zip(axes, shape, strict=True)
-        )
-        if not agrees:
-            raise UserError(f"{path / _TENSORS}: {name!r} has the shape {list(shape)}; {_REMEDY}")
-        floats = name not in ("valid", "covered")
-        if tensors[name].dtype != (torch.float32 if floats else torch.uint8):
-            raise UserError(f"{path / _TENSORS}: {name!r} has the type {tensors[name].dtype}; {_REMEDY}")
-        if floats and (tensors[name].abs() > MAX_NUMBER).any():
-            raise UserError(f"{path / _TENSORS}: {name!r} holds numbers beyond {MAX_NUMBER:g}; {_REMEDY}")
-        finite = tensors[name].isfinite()
+            return f"lacks {name!r}"
+        tensor, shape = tensors[name], list(tensors[name].shape)
+        if len(axes) != len(shape) or [sizes.setdefault(*pair) for pair in zip(axes, shape, strict=True)] != shape:
+            return f"{name!r} has the shape {shape}"
+        if tensor.dtype != (torch.uint8 if name in _FLAGS else torch.float32):
+            return f"{name!r} has the type {tensor.dtype}"
+        absent = torch.zeros_like(tensor, dtype=torch.bool)
         if name == "pixel_residuals":
-            finite |= tensors[name].isnan()
-        if name == "residuals":
-            finite |= tensors[name].isnan() & ((tensors["valid"][:, None] == 0) | finite.any(1, keepdim=True))
-        if not finite.all():
-            raise UserError(f"{path / _TENSORS}: {name!r} holds numbers that are not finite; {_REMEDY}")
-
-
-def _numbers_of(appearance: Appearance) -> dict[str, float]:
-    return {"sigma": appearance.sigma, "light_extent": appearance.light_extent}
-
-
-def _read_appearance(numbers: dict[str, float] | None, tensors: dict[str, Tensor]) -> Appearance | None:
-    if numbers is None:
-        return None
-    sigma, light_extent = float(numbers["sigma"]), float(numbers["light_extent"])
-    if not (0 <= sigma <= MAX_NUMBER and 0 <= light_extent <= MAX_NUMBER):
-        raise ValueError(f"sigma {sigma:g} and light_extent {light_extent:g} are out of range")
-    return Appearance(tensors["texture"], tensors["trust"], tensors["light"], sigma, light_extent)
-
-
-def _residual_summary(residuals: Tensor) -> dict[str, float | None]:
-    known = residuals[residuals.isfinite()].double()
-    if len(known) == 0:
-        return {"median_px": None, "p95_px": None}
-    return {"median_px": float(known.median()), "p95_px": float(known.quantile(0.95))}
+            absent = tensor.isnan()
+        if name == "residuals":  # a camera that found no face, but not the only one
+            absent = tensor.isnan() & ((tensors["valid"][:, None] == 0) | tensor.isfinite().any(1, keepdim=True))
+        if not (absent | (tensor.abs() <= MAX_NUMBER)).all():
+            return f"{name!r} holds numbers that are not finite, or beyond {MAX_NUMBER:g}"
+    return ""

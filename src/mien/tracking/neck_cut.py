@@ -17,9 +17,7 @@ Measured: without the raise, the front of `mono-sides` has 2 dB less (log, "Capt
 _BESIDE = 1.15  # radius that is kept at the neck cut, in radii of the neck. Set by eye
 _SLOPE = 1.0
 """Growth of that radius with the height above the cut. Hair is kept; collars and shoulders are cut off. Set by eye."""
-
-_BAND = 64
-"""Rows of a picture whose cut is computed at once."""
+_BAND = 64  # rows of a picture whose cut is computed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +60,9 @@ class NeckParts:
 
 
 def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Tensor, " 3"]) -> NeckCut:
-    """Fit the cut to a posed mesh.
+    """Fit the cut to a posed mesh, in world coordinates in metres. `up` points to the head's side of the plane.
 
     The plane is parallel to the one that fits the base of the neck best (total least squares).
-
-    Args:
-        parts: The neck's vertices.
-        vertices: The mesh, in world coordinates in metres.
-        up: A direction on the head's side of the plane.
     """
     points, ring = (vertices[indices].double().numpy() for indices in (parts.base, parts.middle))
     center = points.mean(0)

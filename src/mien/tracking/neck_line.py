@@ -1,9 +1,10 @@
 """The neck line: a line through the base of a tracked neck in a picture. Also the vertices of the neck."""
 
-from collections import defaultdict
-
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from mien.camera import Camera
@@ -11,9 +12,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 
 _MIDDLE = (0.4, 0.7)  # range of the middle of the neck, as shares of the way from its base to its top. Set by eye
-
-_CHUNK = 32
-"""Number of timesteps posed at once."""
+_BATCH = 32  # number of timesteps posed at once
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -21,10 +20,13 @@ def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
     faces = face_model.faces
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
     unique, counts = edges.unique(dim=0, return_counts=True)
-    loops = _connected(unique[counts == 1].tolist())
-    assert loops, f"face model {face_model.name!r} is closed: it has no base of the neck"
-    heights = [float(face_model.template[loop, 1].mean()) for loop in loops]
-    return torch.tensor(sorted(loops[heights.index(min(heights))]))
+    boundary = unique[counts == 1].numpy()
+    assert len(boundary), f"face model {face_model.name!r} is closed: it has no base of the neck"
+    size = len(face_model.template)
+    graph = coo_array((np.ones(len(boundary)), boundary.T), (size, size))
+    label = torch.from_numpy(connected_components(graph, directed=False)[1])
+    loops = [(label == one).nonzero()[:, 0] for one in label[boundary[:, 0]].unique()]
+    return min(loops, key=lambda loop: float(face_model.template[loop, 1].mean()))
 
 
 def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -51,8 +53,8 @@ def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camer
     bottom = bottom_vertices(face_model)
     up = torch.tensor([0.0, 0.1, 0.0]).to(face.head_translation)
     lines = []
-    for start in range(0, len(face), _CHUNK):
-        part = face[start : start + _CHUNK]
+    for start in range(0, len(face), _BATCH):
+        part = face[start : start + _BATCH]
         vertices = face_model(part)[:, bottom]
         center = vertices.mean(1)
         above = center + part.T_world_head[:, :3, :3] @ up
@@ -71,25 +73,3 @@ def _line(
     upwards = ((above - inside) * normal).sum(-1, keepdim=True)
     normal = torch.where(upwards < 0, -normal, normal)
     return torch.cat([normal, -(normal * center).sum(-1, keepdim=True)], dim=1)
-
-
-def _connected(edges: list[list[int]]) -> list[list[int]]:
-    """The vertices of each connected component."""
-    neighbors: dict[int, list[int]] = defaultdict(list)
-    for first, second in edges:
-        neighbors[first].append(second)
-        neighbors[second].append(first)
-    components, seen = [], set()
-    for start in neighbors:
-        if start in seen:
-            continue
-        component, pending = [], [start]
-        seen.add(start)
-        while pending:
-            vertex = pending.pop()
-            component.append(vertex)
-            fresh = [other for other in neighbors[vertex] if other not in seen]
-            seen.update(fresh)
-            pending += fresh
-        components.append(component)
-    return components

@@ -87,10 +87,7 @@ def head_cutter(
     head_faces = face_model.faces[~face_model.region_mask("neck")]
     cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
 
-    def mask_of(matte: UInt8[np.ndarray, "h w"], camera: Camera) -> UInt8[np.ndarray, "h w"]:
-        return head_mask(matte, camera, vertices, head_faces, cut)
-
-    return mask_of
+    return lambda matte, camera: head_mask(matte, camera, vertices, head_faces, cut)
 
 
 def head_mask(
@@ -100,14 +97,9 @@ def head_mask(
     head_faces: Int[Tensor, "f 3"],
     cut: NeckCut,
 ) -> UInt8[np.ndarray, "h w"]:
-    """The mask of the head in a camera's matte.
+    """The mask of the head in a camera's matte (255 is person), from the posed mesh of the same timestep.
 
-    Args:
-        matte: The matte; 255 is person.
-        camera: The camera.
-        vertices: The posed mesh, in world coordinates.
-        head_faces: Its triangles without those of the neck.
-        cut: The neck cut of the same timestep.
+    `head_faces` are its triangles without those of the neck.
     """
     head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
     return cut_matte(matte, head, above_neck_cut(cut, camera))
@@ -116,12 +108,9 @@ def head_mask(
 def cut_matte(
     matte: UInt8[np.ndarray, "h w"], head: Bool[np.ndarray, "h w"], keep: Float[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """The matte times `keep`, but whole inside the head. Parts that do not touch the head are removed.
+    """The matte times `keep` (0..1), but whole inside the head. Parts that do not touch the head are removed.
 
-    Args:
-        matte: The matte; 255 is person.
-        head: The projected head without its neck.
-        keep: The share of the matte that is kept outside of the head, 0..1.
+    The head is the projected one without its neck.
     """
     columns = np.flatnonzero(head.any(0))
     margin = round(_SILHOUETTE_MARGIN * (columns[-1] - columns[0] + 1)) if len(columns) else 0
@@ -130,8 +119,7 @@ def cut_matte(
     mask = np.round(matte * np.where(head, np.float32(1), keep)).astype(np.uint8)
     _, labels = cv2.connectedComponents((mask >= _FAINT).astype(np.uint8))
     ours = np.unique(labels[head & (labels > 0)])
-    faint_or_ours = (labels == 0) | np.isin(labels, ours)
-    return np.where(faint_or_ours, mask, 0).astype(np.uint8)
+    return np.where((labels == 0) | np.isin(labels, ours), mask, 0).astype(np.uint8)
 
 
 def head_crop(mask: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " 4"]:

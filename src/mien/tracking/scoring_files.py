@@ -31,13 +31,7 @@ def scoring_exists(path: Path, capture_hash: str | None = None) -> bool:
 
 
 def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
-    """Write a scoring as the folder `path`, all or nothing. An existing scoring of the same capture is kept.
-
-    Args:
-        path: The folder.
-        scoring: The scoring.
-        capture_hash: Hash of the capture that it belongs to.
-    """
+    """Write a scoring as the folder `path`, all or nothing. An existing scoring of the same capture is kept."""
     if scoring_exists(path, capture_hash):
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,12 +59,7 @@ def check_scoring_cut(path: Path, settings: ScoringSettings, capture_hash: str) 
 
 
 def read_scoring(path: Path, capture_hash: str | None = None) -> Scoring:
-    """Read a scoring that `write_scoring` wrote.
-
-    Args:
-        path: The folder.
-        capture_hash: Hash of the capture that it must belong to; None for any.
-    """
+    """Read a scoring that `write_scoring` wrote, of any capture or of the one with this hash."""
     return read_beside_writers(lambda: _read_scoring(path, capture_hash), [path], [path.parent])
 
 
@@ -85,16 +74,17 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     with expect_whole(path / "scoring.json", _REMEDY):
         sides = checked_side(content["height"]), checked_side(content["width"])
         counts = content["timesteps"], content["cameras"]
-    crops = read_arrays(path / "crops.safetensors", _STAGE).get("crops")
+    file = path / "crops.safetensors"
+    crops = read_arrays(file, _STAGE).get("crops")
     # The size of the crops bounds the number of masks that are read. The json may claim any number.
     if crops is None or crops.shape != (*counts, 4) or crops.dtype != np.int32 or crops.size == 0:
-        raise UserError(f"{path / 'crops.safetensors'}: does not hold 4 whole numbers for each frame; {_REMEDY}")
+        raise UserError(f"{file}: does not hold 4 whole numbers for each frame; {_REMEDY}")
     shape = (*crops.shape[:2], *sides)
     left, top, width, height = np.moveaxis(crops.astype(np.int64), -1, 0)
     if min(left.min(), top.min(), width.min(), height.min()) < 0 or not (
         (left + width).max() <= shape[3] and (top + height).max() <= shape[2]
     ):
-        raise UserError(f"{path / 'crops.safetensors'}: a crop extends beyond the picture; {_REMEDY}")
+        raise UserError(f"{file}: a crop extends beyond the picture; {_REMEDY}")
     # Check this before memory for all masks is reserved: a damaged size may ask for more than there is.
     missing = [t_c for t_c in np.ndindex(*shape[:2]) if not _mask_file(path, *t_c).is_file()]
     if missing:
@@ -104,7 +94,7 @@ def _read_scoring(path: Path, capture_hash: str | None) -> Scoring:
     for timestep, camera in np.ndindex(*shape[:2]):
         mask = decode_png(_mask_file(path, timestep, camera), shape[2:], _REMEDY)
         if mask.any() and not crops[timestep, camera, 2:].all():
-            raise UserError(f"{path / 'crops.safetensors'}: a crop is empty although its mask is not; {_REMEDY}")
+            raise UserError(f"{file}: a crop is empty although its mask is not; {_REMEDY}")
         masks.write(timestep, camera, mask)
         digest.update(mask.tobytes())
     digest.update(crops.astype(np.int32).tobytes())
@@ -130,20 +120,14 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str) -> None:
             opened.write(encode_picture(mask))
     crops = scoring.crops.astype(np.int32)
     write_arrays(folder / "crops.safetensors", {"crops": crops})
-    about = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width, "capture_hash": capture_hash}
-    about |= {"cut": scoring.cut}
     digest.update(crops.tobytes())
-    write_json(
-        folder / "scoring.json",
-        _FORMAT,
-        _VERSION,
-        {**about, "sha256": digest.hexdigest()},
-    )
+    about = {"timesteps": timesteps, "cameras": cameras, "height": height, "width": width, "capture_hash": capture_hash}
+    about |= {"cut": scoring.cut, "sha256": digest.hexdigest()}
+    write_json(folder / "scoring.json", _FORMAT, _VERSION, about)
 
 
 def _cut_of(path: Path, content: Mapping[str, Any]) -> Literal["plane", "line"]:
-    """The cut that scoring.json names. Masks that were written before there was a choice have the plane."""
-    cut = content.get("cut", "plane")
+    cut = content.get("cut")
     if cut not in ("plane", "line"):
         raise UserError(f"{path / 'scoring.json'}: cut {cut!r:.60} is neither plane nor line; {_REMEDY}")
     return cut

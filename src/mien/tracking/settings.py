@@ -42,16 +42,8 @@ class PhotometricSettings:
     side nearest to it. The texture is estimated again before each round."""
     texture_size: Annotated[int, _TEXELS] = 512
     """Texels along each side of the texture."""
-    texture_frames: Annotated[int, COUNT] = 48
-    """Frames of each sequence that the texture is estimated from."""
-    reference_angle: Annotated[float, POSITIVE] = 0.12
-    """Head rotation from the median pose, in radians, within which frames decide the texture; others hardly count. With
-    equal weights every pose would keep its own error, because the texture would reproduce it wherever only such frames
-    see the skin. With several cameras all frames count alike, because each pose is seen from many sides."""
     shared_steps: Annotated[int, COUNT_OR_NONE] = 3
     """Gauss-Newton steps of identity and focal length before each round but the first."""
-    shared_steps_of_cameras: Annotated[int, COUNT_OR_NONE] = 8
-    """The same number for several cameras. They see depth, so the shape keeps improving for more steps."""
     keyframes: Annotated[int, COUNT] = 24
     """Timesteps of each sequence for these steps. With several cameras there are fewer, so that the number of pictures
     is at most about twice this number."""
@@ -69,33 +61,12 @@ class PhotometricSettings:
     landmark_share: Annotated[float, FRACTION] = 0.3
     """Weight of landmarks, as a share of their weight in the fit to landmarks alone. Those of lips, lids and irises
     keep their full weight."""
-    light_extent: Annotated[float, POSITIVE] = 0.012
-    """Extent on the face, in metres, over which a smooth difference counts as light that the model does not explain."""
     outlier: Annotated[float, POSITIVE] = 10.0
     """Number of standard deviations of its colour beyond which a pixel's pull fades. It is large, because faces that
     are off by some pixels make most pixels differ by several, and the fit learns from those."""
     lids: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the colours in the eyes against the lids of the fit: 1 as measured, 0 switches it off. The detector
     misses blinks behind glasses."""
-
-
-@dataclass(frozen=True)
-class PaperRates:
-    """Learning rates of Adam at the start of a fit. The global epochs start at a tenth of them."""
-
-    frame: Annotated[float, NOT_NEGATIVE] = 0.3
-    """Learning rate of a frame's own parameters, in standard deviations that its landmarks leave, so that head rotation
-    and translation, or two expressions that look alike, do not hinder each other."""
-    identity: Annotated[float, NOT_NEGATIVE] = 1e-2
-    """Learning rate of identity coefficients."""
-    offsets: Annotated[float, NOT_NEGATIVE] = 1e-4
-    """Learning rate of vertex offsets, in metres."""
-    texture: Annotated[float, NOT_NEGATIVE] = 1e-2
-    """Learning rate of the albedo (0..1)."""
-    light: Annotated[float, NOT_NEGATIVE] = 5e-3
-    """Learning rate of the light's spherical harmonics."""
-    focal: Annotated[float, NOT_NEGATIVE] = 1e-3
-    """Learning rate of the logarithm of an unknown focal length."""
 
 
 @dataclass(frozen=True)
@@ -119,37 +90,15 @@ class PaperSettings:
     """Passes over all frames in random order that refine everything."""
     texture_size: Annotated[int, _TEXELS] = 512
     """Texels along each side of the texture."""
-    texture_steps: Annotated[int, COUNT_OR_NONE] = 8
-    """Optimiser steps for texels that a frame shows better than earlier frames. Only with start `landmarks`."""
     shrink: Annotated[int, Range(1, 64)] = 1
     """Factor by which pictures are scaled down for the fit. 2 is four times as fast, and less exact."""
     color_weight: Annotated[float, NOT_NEGATIVE] = 3e3
     """Weight of the mean colour difference (0..1) between picture and rendering. In the other costs, one squared
     standard deviation counts 1."""
-    color_epsilon: Annotated[float, POSITIVE] = 0.02
-    """Colour difference below which the pull fades."""
-    light_extent: Annotated[float, POSITIVE] = 0.012
-    """Extent on the face, in metres, over which a smooth difference counts as light that the model does not explain."""
     landmark_share: Annotated[float, FRACTION] = 0.3
     """Weight of landmarks, as a share of their weight in the fit to landmarks alone."""
-    gap_weight: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Weight of the gaps between lids and between lips, relative to a landmark's weight."""
-    identity_sigma: Annotated[float, POSITIVE] = 0.5
-    """Standard deviation of identity coefficients from those of the fit to landmarks."""
     offset_sigma: Annotated[float, NOT_NEGATIVE] = 0.002
     """Standard deviation of vertex offsets, in metres; 0 switches them off."""
-    offset_bend: Annotated[float, POSITIVE] = 0.0001
-    """Standard deviation of a vertex's offset from the mean of its neighbours', in metres."""
-    texture_roughness: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Standard deviation of the difference between neighbouring texels."""
-    light_sigma: Annotated[float, POSITIVE] = 0.3
-    """Standard deviation of the light's spherical harmonics from an even light."""
-    gray_sigma: Annotated[float, POSITIVE] = 0.05
-    """Standard deviation of the light's colour channels from their mean."""
-    focal_sigma: Annotated[float, POSITIVE] = 0.03
-    """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""
-    rates: PaperRates = field(default_factory=PaperRates)
-    """Learning rates."""
 
 
 @dataclass(frozen=True)
@@ -167,13 +116,9 @@ class TrackingSettings:
     contour points. Irises always count, for the gaze."""
     keyframes: Annotated[int, COUNT] = 20
     """Frames of each sequence from which identity is fitted. They are chosen for different head poses."""
-    landmark_sigma: Annotated[float, POSITIVE] = 0.0015
-    """Expected error of a landmark, in metres on the face."""
     independent_landmarks: Annotated[float, POSITIVE] = 25.0
     """Number of independent landmarks that all landmarks of a picture are worth, because their errors are correlated.
     It weighs them against priors and smoothness."""
-    outlier: Annotated[float, POSITIVE] = 6.0
-    """Number of sigmas beyond which a landmark's pull fades."""
     identity_weight: Annotated[float, NOT_NEGATIVE] = 4.0
     """Weight of the identity's unit-variance prior."""
     bias_sigma: Annotated[float, POSITIVE] = 0.003

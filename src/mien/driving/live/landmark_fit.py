@@ -17,11 +17,12 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting.parameters import layout_of
-from mien.tracking.fitting.shot import FOCAL
+from mien.tracking.fitting.sequence import FOCAL
 from mien.tracking.landmarks.detector_response import LARGEST_TURN, read_response
 from mien.tracking.landmarks.groups import EYE_CORNERS, NOSE, landmark_weights
-from mien.tracking.landmarks.head_pose import FIRST_OUTLIER
+from mien.tracking.landmarks.stages import FIRST_OUTLIER
 from mien.tracking.landmarks.model import reduce_face_model
+from mien.tracking.landmarks.term import LANDMARK_SIGMA
 from mien.tracking.settings import TrackingSettings
 
 _LIVE_STEP = 0.5
@@ -96,7 +97,7 @@ class LandmarkFit:
         self._rigid = np.zeros(len(weights))
         self._rigid[list(NOSE + EYE_CORNERS)] = 1.0
         self._rigid *= settings.independent_landmarks / self._rigid.sum()
-        self._sigma = settings.landmark_sigma
+        self._sigma = LANDMARK_SIGMA
         self._held = np.zeros(count)
         self._last: Fitted | None = None
 

@@ -1,6 +1,5 @@
 """The parameters that the `paper` schedule fits, and the constants of the fit."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,17 +10,16 @@ from torch.nn.functional import interpolate
 from mien.camera import Camera
 from mien.face.model import FaceModel, Landmarks
 from mien.render.mesh_gradients import LitMesh, mesh_edges
-from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, SequenceFit, Subject, smoothness_of
+from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, Subject
 from mien.tracking.fitting.parameters import ParameterLayout
-from mien.tracking.fitting.shot import Shot
 from mien.tracking.fitting.solver import Smoothness
 from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS
-from mien.tracking.landmarks.model import LandmarkModel
-from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, quiet_landmarks
+from mien.tracking.landmarks.problem import Problem
+from mien.tracking.landmarks.term import LandmarkTerm, quiet_landmarks
 from mien.tracking.pixels.pictures import Pictures
 from mien.tracking.pixels.texture import PhotometricFit, even_light, texture_space
-from mien.tracking.settings import PaperSettings, TrackingSettings
+from mien.tracking.settings import PaperSettings
 
 _STIFF_REGIONS = ("eyes", "irises", "eyelids", "teeth", "tongue", "mouth", "eye_sockets", "scalp", "neck", "ears")
 """Regions without vertex offsets. They close on each other, or the pictures do not show where they are."""
@@ -119,32 +117,36 @@ class PaperScene:
         return Camera(cameras.K[camera], cameras.viewmat[camera], capture.width, capture.height)
 
 
-def paper_scene(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    fit: Fit,
-    settings: TrackingSettings,
-    refined: PhotometricFit | None = None,
-) -> PaperScene:
+def paper_scene(problem: Problem, fit: Fit, refined: PhotometricFit | None = None) -> PaperScene:
     """The constants of the fit, from a fit to landmarks and, if there is one, a fit to pixels (`refined`)."""
-    face_model = model.face_model.to(torch.zeros(()))
+    face_model, layout = problem.model.face_model.to(torch.zeros(())), problem.model.layout
     used = ~face_model.region_mask(*HIDING_REGIONS)
     weights = used.float() if refined is None else used * _trust(face_model, refined)
     mesh = LitMesh(
         face_model.faces.contiguous(), face_model.uv[face_model.uv_faces].contiguous(), weights,
         mesh_edges(face_model.faces, used),
     )  # fmt: skip
-    sequences = [
-        _sequence(model, shot, own, lens, settings)
-        for shot, own, lens in zip(shots, fit.sequences, lenses, strict=True)
-    ]
     return PaperScene(
-        face_model, model.layout, model.layout.precision.float(), face_model.landmarks["mediapipe"],
-        fit.subject.bias, mesh, weights,
-        fit.subject.identity.float(), _offset_share(face_model), _neighbors(face_model), tuple(sequences),
-        settings.paper,
+        face_model, layout, layout.precision.float(), face_model.landmarks["mediapipe"], fit.subject.bias, mesh,
+        weights, fit.subject.identity.float(), _offset_share(face_model), _neighbors(face_model),
+        _sequences(problem, fit), problem.settings.paper,
     )  # fmt: skip
+
+
+def _sequences(problem: Problem, fit: Fit) -> tuple[SequenceScene, ...]:
+    settings, scenes = problem.settings.paper, []
+    parts = zip(
+        problem.data, fit.sequences, problem.lenses, problem.landmark_terms(fit), problem.smoothness(fit), strict=True
+    )
+    for data, sequence, lens, term, smoothness in parts:
+        cameras, term = sequence.cameras, quiet_landmarks(term, settings.landmark_share)
+        scenes.append(SequenceScene(
+            data.timesteps, Pictures(data.capture, settings.shrink),
+            CameraBatch(cameras.K.float(), cameras.viewmat.float()),
+            Smoothness(smoothness.precision.float(), smoothness.linked), lens,
+            tuple(term.at(torch.tensor([row])) for row in range(len(sequence.state))),
+        ))  # fmt: skip
+    return tuple(scenes)
 
 
 def _trust(face_model: FaceModel, refined: PhotometricFit) -> Float[Tensor, " f"]:
@@ -157,18 +159,17 @@ def _trust(face_model: FaceModel, refined: PhotometricFit) -> Float[Tensor, " f"
     return (sums / texels.clamp_min(1))[:count].float()
 
 
-def first_state(
-    scene: PaperScene, fit: Fit, lenses: Sequence[int | None], refined: PhotometricFit | None = None
-) -> PaperState:
+def first_state(scene: PaperScene, fit: Fit, refined: PhotometricFit | None = None) -> PaperState:
     """The state at the start, from the given fit. Texture and light are even unless there is a fit to pixels."""
     lights = [even_light() for _ in scene.sequences] if refined is None else list(refined.lights)
+    lenses = {sequence.lens for sequence in scene.sequences if sequence.lens is not None}
     return PaperState(
         identity=scene.identity.clone(),
         offsets=torch.zeros_like(scene.face_model.template),
         texture=_first_texture(scene.settings.texture_size, refined),
         lights=torch.stack(lights),
-        log_focals=torch.zeros(len({lens for lens in lenses if lens is not None})),
-        frames=[own.state.float() for own in fit.sequences],
+        log_focals=torch.zeros(len(lenses)),
+        frames=[sequence.state.float() for sequence in fit.sequences],
         visibility=torch.zeros(len(scene.mesh.faces)),
     )
 
@@ -182,20 +183,6 @@ def _first_texture(size: int, refined: PhotometricFit | None) -> Float[Tensor, "
     filled = torch.where(known[..., None], albedo, albedo[known].median(0).values)
     planes = interpolate(filled.movedim(2, 0)[None], (size, size), mode="bilinear", antialias=True)
     return planes[0].movedim(0, 2).contiguous()
-
-
-def _sequence(
-    model: LandmarkModel, shot: Shot, own: SequenceFit, lens: int | None, settings: TrackingSettings
-) -> SequenceScene:
-    cameras = own.cameras
-    term = quiet_landmarks(all_landmarks(model, shot.views, own, settings), settings.paper.landmark_share)
-    smoothness = smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, cameras)
-    return SequenceScene(
-        shot.valid.nonzero()[:, 0], Pictures(shot.capture, settings.paper.shrink),
-        CameraBatch(cameras.K.float(), cameras.viewmat.float()),
-        Smoothness(smoothness.precision.float(), smoothness.linked), lens,
-        tuple(term.at(torch.tensor([row])) for row in range(len(own.state))),
-    )  # fmt: skip
 
 
 def _offset_share(face_model: FaceModel) -> Float[Tensor, "v 1"]:

@@ -1,15 +1,15 @@
 """The state of a fit: the subject, its sequences, and what every fit agrees on."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mien.machine.progress import Advance
+from mien.machine.progress import Advance, progress_bar
 from mien.tracking.fitting.parameters import ParameterLayout
 from mien.tracking.fitting.solver import Smoothness
 from mien.tracking.fitting.views import CameraBatch
@@ -100,14 +100,9 @@ def smoothness_of(
     settings: SmoothnessSettings,
     cameras: CameraBatch | None = None,
 ) -> Smoothness:
-    """The smoothness cost over the valid timesteps. Missing timesteps break the chain.
+    """The smoothness cost over the timesteps with a face. Missing timesteps break the chain.
 
-    Args:
-        layout: Layout of the parameters.
-        valid: Timesteps in which a face was found.
-        fps: Frames per second.
-        settings: The smoothness settings.
-        cameras: Cameras of the sequence. A single camera sees depth less well. The default looks along z.
+    A single camera sees depth less well. Without `cameras` it looks along z.
     """
     sigmas = torch.full((layout.size,), math.inf, dtype=torch.float64)
     sigmas[:3] = settings.rotation
@@ -130,32 +125,21 @@ def widen(pose: Float[Tensor, "v 6"], layout: ParameterLayout) -> Float[Tensor, 
     return torch.cat([pose, pose.new_zeros(len(pose), layout.size - 6)], dim=1)
 
 
-@runtime_checkable  # Beartype needs this to check annotations during tests.
-class Watch(Protocol):
-    """Receives the progress of a running fit."""
-
-    def __call__(self, stage: str, progress: float, current: Callable[[], object] | None = None) -> None:
-        """Receive the stage that runs, the share of its work that is done, and, if the fit changed, a way to get it.
-
-        `current` returns a `Fit` or a `PhotometricFit`. It may be called later, or never.
-        """
-        ...
-
-
-def ignore_progress(stage: str, progress: float, current: Callable[[], object] | None = None) -> None:
-    """Ignore the progress. This is the `Watch` of a fit that nobody watches."""
+Callback = Callable[[str, float, Callable[[], object] | None], object]
+"""Receives the stage that runs, the share of its work that is done, and, if the fit changed, a function that returns it
+(a `Fit` or a `PhotometricFit`), which may be called later, or never."""
 
 
 @dataclass(eq=False)
-class Course:
-    """The progress of one kind of fit, reported to a progress bar and to a watch. Mutable."""
+class Progress:
+    """The progress of one kind of fit, reported to a progress bar and to a callback. Mutable."""
 
     name: str
     """Name of the fit, which begins the name of each stage."""
     total: int
     """Amount of work."""
     bar: Advance
-    watch: Watch
+    callback: Callback | None
     done: int = 0
     """Amount of work that is done."""
 
@@ -166,5 +150,13 @@ class Course:
         self.show(status, current)
 
     def show(self, status: str, current: Callable[[], object] | None = None) -> None:
-        """Tell the watch which stage runs, and how to get the fit."""
-        self.watch(f"{self.name}, {status}", self.done / self.total, current)
+        """Tell the callback which stage runs, and how to get the fit."""
+        if self.callback is not None:
+            self.callback(f"{self.name}, {status}", self.done / self.total, current)
+
+
+@contextmanager
+def show_progress(title: str, name: str, total: int, callback: Callback | None, done: int = 0) -> Iterator[Progress]:
+    """Show a progress bar for a fit, and report to the callback."""
+    with progress_bar(title, total, done) as bar:
+        yield Progress(name, total, bar, callback, done)

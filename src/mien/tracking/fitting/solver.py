@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-_START_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-7, 1e7
 SEGMENT = 1024
 """Number of blocks of a chain whose factors are in memory at once: about 120 MB for pairs of frames with 60 parameters.
 """
@@ -47,7 +46,7 @@ class Bounds:
     lower: Float[Tensor, " p"]
     upper: Float[Tensor, " p"]
 
-    def clip(self, state: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+    def clip(self, state: Float[Tensor, "*b p"]) -> Float[Tensor, "*b p"]:
         """The nearest state within the bounds."""
         return torch.minimum(torch.maximum(state, self.lower), self.upper)
 
@@ -68,25 +67,18 @@ def minimize_frames(
     Parameters held by a bound take no part in the step (a projected Newton step), and the result is clipped.
     """
     state = bounds.clip(start)
-    damping = state.new_full((len(state),), _START_DAMPING)
+    damping = state.new_full((len(state),), 1e-3)
     for _ in range(iterations):
         equations = equations_at(state)
-        held = bounds.held(state, equations.gradient)
-        step = _damped_step(equations, held, damping)
-        candidate = bounds.clip(state + step)
+        moving = hold(equations, bounds.held(state, equations.gradient))
+        diagonal = moving.hessian.diagonal(dim1=-2, dim2=-1)
+        damped = moving.hessian + torch.diag_embed(diagonal * damping[:, None] + 1e-12)
+        step = torch.cholesky_solve(moving.gradient[..., None], torch.linalg.cholesky(damped))[..., 0]
+        candidate = bounds.clip(state - step)
         better = cost_at(candidate) < equations.cost
         state = torch.where(better[:, None], candidate, state)
-        damping = torch.where(better, damping / 5, damping * 8).clamp(_MIN_DAMPING, _MAX_DAMPING)
+        damping = torch.where(better, damping / 5, damping * 8).clamp(1e-7, 1e7)
     return state
-
-
-def _damped_step(
-    equations: NormalEquations, held: Bool[Tensor, "b p"], damping: Float[Tensor, " b"]
-) -> Float[Tensor, "b p"]:
-    moving = hold(equations, held)
-    diagonal = moving.hessian.diagonal(dim1=-2, dim2=-1)
-    damped = moving.hessian + torch.diag_embed(diagonal * damping[:, None] + 1e-12)
-    return -torch.cholesky_solve(moving.gradient[..., None], torch.linalg.cholesky(damped))[..., 0]
 
 
 def hold(equations: NormalEquations, held: Bool[Tensor, "b p"]) -> NormalEquations:

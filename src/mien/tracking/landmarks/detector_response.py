@@ -20,8 +20,6 @@ from mien.face.model import FaceModel
 LARGEST_TURN = 0.6
 """Largest turn of the head from which the detector's response was measured, in radians. Farther turns count as this
 one. It belongs to the drawn people of the measurement (log, "The landmark detector")."""
-
-_COMMAND = "python -m mien.lab.synthetic.detector_calibration"
 _ARRAYS = ("mean", "by_turn", "by_expression", "by_person")
 _OF_MEDIAPIPE = ("by_expression", "by_person")
 """Arrays that every detector has from mediapipe's file, because they were measured on more people there."""
@@ -112,6 +110,6 @@ def write_response(
     ending = "" if detector == "mediapipe" else f" --detector {detector}"
     np.savez_compressed(
         path, rest_sigma=1e3 * response.rest_sigma, people=people, topology_hash=face_model.topology_hash,
-        content_hash=face_model.content_hash, command=f"{_COMMAND} {face_model.name}{ending}",
-        **arrays,
+        content_hash=face_model.content_hash,
+        command=f"python -m mien.lab.synthetic.detector_calibration {face_model.name}{ending}", **arrays,
     )  # fmt: skip

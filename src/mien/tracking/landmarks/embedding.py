@@ -28,7 +28,7 @@ _SCALP_FRONT = 0.06  # landmarks may lie on the scalp only farther ahead of the 
 _LEAST_SEEN = 0.25
 """Landmarks may lie on a triangle only if it is seen in at least this share of the pictures. Measured against 0:
 landmarks of lids lie up to 0.9 instead of 3.0 mm inside the eyeball (log, "Face model")."""
-_SUBDIVISIONS = 12  # number of steps along a triangle's side between the points that are tried
+_CLAMP = 10.0  # errors are clamped to this many pixels, because detections fail now and then
 COARSE_VIEWS = 16  # number of views of the coarse search over all triangles
 COARSE_SUBDIVISIONS = 3  # number of steps along a triangle's side in the coarse search
 _BEST_TRIANGLES = 16  # number of triangles that the coarse search passes on
@@ -46,16 +46,6 @@ class EmbeddingSettings:
     """Number of pictures drawn. The detector fails on some of them."""
     size: int = 512
     """Width and height of the pictures, in pixels."""
-    yaw: float = 0.45
-    """Largest turn to either side, in radians."""
-    pitch: float = 0.2
-    """Largest turn up or down, in radians."""
-    gaze: float = 0.2
-    """Largest turn of the eyes in any direction, in radians."""
-    identity: float = 0.8
-    """Standard deviation of the identity coefficients."""
-    clamp: float = 10.0
-    """Errors are clamped to this many pixels, because detections fail now and then."""
     seed: int = 0
 
 
@@ -71,26 +61,21 @@ class DetectedViews:
     """Detected landmarks, in pixels."""
 
 
-def embed_landmarks(
-    model: FaceModel, settings: EmbeddingSettings | None = None
-) -> tuple[dict[str, Landmarks], Float[Tensor, " l"]]:
+def embed_landmarks(model: FaceModel, settings: EmbeddingSettings) -> tuple[dict[str, Landmarks], Float[Tensor, " l"]]:
     """The landmark sets `mediapipe` and `ibug68` of a face model, and the median errors of MediaPipe's in pixels."""
-    settings = settings or EmbeddingSettings()
     views, seen = _draw_and_detect(model, settings)
     faces, barycentric = torch.empty(LANDMARKS, dtype=torch.long), torch.empty(LANDMARKS, 3)
     errors = torch.empty(LANDMARKS)
     on_eyes, on_face = (_allowed(model, regions, seen) for regions in (_EYE_REGIONS, _FACE_REGIONS))
     for landmark in track_progress(range(LANDMARKS), "Placing landmarks", LANDMARKS):
         allowed = on_eyes if landmark in LEFT_IRIS + RIGHT_IRIS else on_face
-        faces[landmark], barycentric[landmark], errors[landmark] = best_point(
-            views, model.faces, allowed, landmark, settings.clamp
-        )
+        faces[landmark], barycentric[landmark], errors[landmark] = best_point(views, model.faces, allowed, landmark)
     mediapipe = Landmarks(faces, barycentric)
     subset = torch.tensor(IBUG68)
     return {"mediapipe": mediapipe, "ibug68": Landmarks(faces[subset], barycentric[subset])}, errors
 
 
-def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.Generator) -> FaceParams:
+def random_face(model: FaceModel, generator: torch.Generator) -> FaceParams:
     """One timestep of a random person with a mild expression, turned a little, at the world's origin.
 
     Half of the people open the mouth and a third close the eyes. From closed lips or open lids alone, a point of the
@@ -114,19 +99,18 @@ def random_face(model: FaceModel, settings: EmbeddingSettings, generator: torch.
             expression[:, index] = blink
     expression = expression.clamp(model.expression_bounds[:, 0], model.expression_bounds[:, 1])
     joints = neutral.joints.clone()
-    gaze = settings.gaze * uniform(3) * torch.tensor([0.6, 1.0, 0.0])
+    gaze = 0.2 * uniform(3) * torch.tensor([0.6, 1.0, 0.0])
     for index, name in enumerate(model.free_joint_names):
         if name in ("left_eye", "right_eye"):
             joints[:, index] = gaze
         elif name == "jaw":
             joints[:, index, 0] = 0.25 * opening
-    limits = torch.tensor([settings.pitch, settings.yaw, 0.1])
     return replace(
         neutral,
-        identity=settings.identity * torch.randn(neutral.identity.shape, generator=generator),
+        identity=0.8 * torch.randn(neutral.identity.shape, generator=generator),
         expression=expression,
         joints=joints,
-        head_rotation=uniform(1, 3) * limits,
+        head_rotation=uniform(1, 3) * torch.tensor([0.2, 0.45, 0.1]),
     )
 
 
@@ -139,13 +123,12 @@ def _sometimes(share: float, generator: torch.Generator) -> float:
 def paint(model: FaceModel, generator: torch.Generator) -> Float[Tensor, "f 3 3"]:
     """An albedo for the corners of every triangle: one colour per region, with a random skin tone."""
     skin = torch.tensor([0.85, 0.65, 0.55]) * (0.55 + 0.45 * torch.rand(1, generator=generator))
-    tint = torch.tensor([1.0, 1.0, 1.0])
     tones = {
         "lips": skin * torch.tensor([0.95, 0.6, 0.62]),
         "brows": skin * 0.3,
-        "eyes": 0.92 * tint,
+        "eyes": torch.tensor([0.92, 0.92, 0.92]),
         "irises": torch.tensor([0.22, 0.15, 0.10]),
-        "teeth": 0.9 * tint,
+        "teeth": torch.tensor([0.9, 0.9, 0.9]),
         "tongue": torch.tensor([0.6, 0.25, 0.25]),
         "mouth": torch.tensor([0.25, 0.08, 0.08]),
         "eyelids": skin * 0.8,
@@ -159,12 +142,12 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Det
     """Draw the pictures and detect landmarks. Also returns the share of the pictures in which each triangle is seen."""
     seen = torch.zeros(len(model.faces))
     generator = torch.Generator().manual_seed(settings.seed)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    views: list[tuple[Tensor, Tensor, Tensor]] = []
     module = load_solution("face_mesh")
     with quiet_mediapipe(), module.FaceMesh(static_image_mode=True, max_num_faces=1, refine_landmarks=True) as mesh:
         mesh.process(np.zeros((64, 64, 3), np.uint8))
         for _ in track_progress(range(settings.pictures), "Drawing and detecting", settings.pictures):
-            vertices = model(random_face(model, settings, generator))[0]
+            vertices = model(random_face(model, generator))[0]
             camera = _random_camera(settings, generator)
             side, up = torch.rand(2, generator=generator).tolist()
             lamp = Headlight(direction=(side - 0.5, -0.3 - 0.5 * up, -1.0), ambient=0.45)
@@ -175,15 +158,15 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Det
             if faces:
                 points = torch.tensor([(point.x, point.y) for point in faces[0].landmark]) * settings.size
                 pixels, depth = camera.project(vertices)
-                found.append((pixels, depth, points))
+                views.append((pixels, depth, points))
                 drawn = rasterize_mesh(vertices, model.faces, camera.resized(2 * camera.width, 2 * camera.height))
                 seen[drawn.face_index[drawn.face_index >= 0].unique().long()] += 1
-    if len(found) < settings.pictures // 2:
+    if len(views) < settings.pictures // 2:
         raise UserError(
-            f"the landmark detector found a face in {len(found)} of {settings.pictures} pictures of {model.name}: "
+            f"the landmark detector found a face in {len(views)} of {settings.pictures} pictures of {model.name}: "
             "check the regions and the head frame of the model"
         )
-    return DetectedViews(*(torch.stack(parts) for parts in zip(*found, strict=True))), seen / len(found)
+    return DetectedViews(*(torch.stack(parts) for parts in zip(*views, strict=True))), seen / len(views)
 
 
 def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> Camera:
@@ -203,7 +186,7 @@ def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]
 
 
 def best_point(
-    views: DetectedViews, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int, clamp: float
+    views: DetectedViews, faces: Int[Tensor, "f 3"], allowed: Bool[Tensor, " f"], landmark: int
 ) -> tuple[Tensor, Float[Tensor, " 3"], Tensor]:
     """Triangle, barycentric weights and median error of the point with the least sum of clamped pixel errors."""
     # First try few points of all triangles in some of the views, then all points of the best triangles in all views.
@@ -212,11 +195,11 @@ def best_point(
     )
     everywhere = allowed.nonzero()[:, 0]
     rough = _errors(some, faces[everywhere], _triangle_grid(COARSE_SUBDIVISIONS), landmark)
-    scores = rough.clamp_max(4 * clamp).sum(0).amin(1)
+    scores = rough.clamp_max(4 * _CLAMP).sum(0).amin(1)
     triangles = everywhere[scores.topk(min(_BEST_TRIANGLES, len(scores)), largest=False).indices]
-    weights = _triangle_grid(_SUBDIVISIONS)
+    weights = _triangle_grid(12)  # number of steps along a triangle's side between the points that are tried
     error = _errors(views, faces[triangles], weights, landmark)
-    best = int(error.clamp_max(clamp).sum(0).argmin())
+    best = int(error.clamp_max(_CLAMP).sum(0).argmin())
     triangle, point = divmod(best, len(weights))
     return triangles[triangle], weights[point], error[:, triangle, point].median()
 

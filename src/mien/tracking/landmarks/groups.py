@@ -7,12 +7,6 @@ from torch import Tensor
 from mien.capture.person.faces import LANDMARKS
 from mien.tracking.settings import LandmarkSet
 
-_OVAL_WEIGHT = 0.15  # weight of landmarks on the face's outline, where that of a landmark of the cheeks is 1
-_NOSE_WEIGHT = 3.0  # the same of the nose
-_LIPS_WEIGHT = 3.0  # the same of the lips
-_EYELIDS_WEIGHT = 5.0  # the same of the eyelids
-_IRISES_WEIGHT = 4.0  # the same of the irises
-
 OVAL = (
     10, 21, 54, 58, 67, 93, 103, 109, 127, 132, 136, 148, 149, 150, 152, 162, 172, 176, 234, 251, 284, 288, 297, 323,
     332, 338, 356, 361, 365, 377, 378, 379, 389, 397, 400, 454,
@@ -51,11 +45,11 @@ def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"
     """Weight of each landmark in a fit. It is 0 for landmarks outside the set, and the mean is 1."""
     weights = torch.ones(LANDMARKS, dtype=torch.float64)
     for group, weight in (
-        (OVAL, _OVAL_WEIGHT),
-        (NOSE, _NOSE_WEIGHT),
-        (LIPS, _LIPS_WEIGHT),
-        (LEFT_EYELIDS + RIGHT_EYELIDS, _EYELIDS_WEIGHT),
-        (LEFT_IRIS + RIGHT_IRIS, _IRISES_WEIGHT),
+        (OVAL, 0.15),  # weight of landmarks on the face's outline, where that of a landmark of the cheeks is 1
+        (NOSE, 3.0),  # the same of the nose
+        (LIPS, 3.0),  # the same of the lips
+        (LEFT_EYELIDS + RIGHT_EYELIDS, 5.0),  # the same of the eyelids
+        (LEFT_IRIS + RIGHT_IRIS, 4.0),  # the same of the irises
     ):
         weights[list(group)] = weight
     if landmarks == "ibug51":

@@ -1,6 +1,5 @@
 """A face model reduced to its landmarks, with analytic derivatives for Levenberg-Marquardt."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import left_jacobian, matrix_from_axis_angle
-from mien.tracking.fitting.parameters import ParameterLayout
+from mien.tracking.fitting.parameters import ParameterLayout, joint_derivatives
 from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.detector_response import DetectorResponse, unknown_response
 from mien.tracking.settings import TrackingSettings
@@ -132,30 +131,13 @@ class LandmarkModel:
         self, transforms: Float[Tensor, "v k 4 4"], shaped: Float[Tensor, "v k l 3"], face: FaceParams
     ) -> tuple[Float[Tensor, "v l 3 m"], Float[Tensor, "v l 3 d"]]:
         """Derivatives of head-frame points through the joints: by free angles, and by expressions that move a joint."""
-        free, derived = self.layout.joint_index, self.layout.derived_expression
-        count, angles = len(free), face.joints.flatten(1)
-        at = torch.cat([angles[:, free], face.expression[:, derived]], dim=1)
-        if at.shape[1] == 0:
-            nothing = shaped.new_zeros(len(shaped), shaped.shape[2], 3, 0)
-            return nothing, nothing
-
-        def joints(parameters: Float[Tensor, "n q"]) -> Tensor:
-            repeated = angles.repeat(len(parameters) // len(angles), 1)
-            return repeated.index_copy(1, free, parameters[:, :count]).reshape(-1, *face.joints.shape[1:])
-
-        def moved_transforms(parameters: Float[Tensor, "n q"]) -> Tensor:
-            times = len(parameters) // len(angles)
-            expression = face.expression.repeat(times, 1).index_copy(1, derived, parameters[:, count:])
-            head = face.head_rotation.repeat(times, 1), face.head_translation.repeat(times, 1)
-            moved_face = FaceParams(face.identity, expression, joints(parameters), *head, face.vertex_offsets)
-            return self._joint_transforms(moved_face)[:, :, :3]
-
-        by_parameter = _derivatives(moved_transforms, at)
+        by_parameter, by_turns = joint_derivatives(self.layout, self.face_model, face)
+        by_parameter = by_parameter[:, :, self.joints]
         motion = torch.einsum("mvkrc,vklc->vlrm", by_parameter[..., :3], shaped)
         motion = motion + torch.einsum("mvkr,kl->vlrm", by_parameter[..., 3], self.joint_weights)
         if self.pose_basis is not None:
-            turns = _derivatives(lambda moved: matrix_from_axis_angle(joints(moved)).flatten(1), at)
-            motion = motion + torch.einsum("vlrq,mvq->vlrm", _through_joints(transforms, self.pose_basis), turns)
+            motion = motion + torch.einsum("vlrq,mvq->vlrm", _through_joints(transforms, self.pose_basis), by_turns)
+        count = len(self.layout.joint_index)
         return motion[..., :count], motion[..., count:]
 
     def _joint_transforms(self, face: FaceParams) -> Float[Tensor, "v k 4 4"]:
@@ -247,15 +229,3 @@ def _through_joints(transforms: Float[Tensor, "v k 4 4"], basis: Float[Tensor, "
     left = transforms[:, :, :3, :3].transpose(1, 2).reshape(timesteps * 3, joints * 3)
     right = basis.permute(1, 3, 2, 0).reshape(joints * 3, -1)
     return (left @ right).reshape(timesteps, 3, basis.shape[2], len(basis)).transpose(1, 2)
-
-
-def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, "v q"]) -> Float[Tensor, "q v ..."]:
-    """Derivatives of a function of n parameter vectors by each parameter, by central differences.
-
-    The function is called once, with all v vectors at all 2 q steps. Only the short chain of joints is differentiated
-    this way. In float64 the error is below 1e-9.
-    """
-    count, parameters = at.shape
-    step = 1e-5 * torch.eye(parameters).to(at)[:, None]
-    above, below = function(torch.cat([at + step, at - step]).flatten(0, 1)).unflatten(0, (2, parameters, count))
-    return (above - below) / 2e-5

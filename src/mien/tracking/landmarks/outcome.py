@@ -1,4 +1,4 @@
-"""The result of a fit as a Tracking: in world space, for every timestep."""
+"""The result of a fit as a Tracking: in world space, for every timestep, after a last correction of expressions."""
 
 import dataclasses
 import json
@@ -13,57 +13,46 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting.fit import SequenceFit, Subject
-from mien.tracking.fitting.shot import Shot
-from mien.tracking.landmarks.model import LandmarkModel
-from mien.tracking.landmarks.term import all_landmarks
+from mien.tracking.fitting.sequence import SequenceData
+from mien.tracking.landmarks.problem import Problem
+from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks
 from mien.tracking.neck_line import fit_neck_lines
-from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
+
+_MIN_TURN = 1e-4
+"""Standard deviation of a rotation below which the head counts as still, in radians."""
 
 
 def as_tracking(
-    shot: Shot,
-    face_model: FaceModel,
-    model: LandmarkModel,
-    subject: Subject,
-    own: SequenceFit,
-    settings: TrackingSettings,
+    problem: Problem, face_model: FaceModel, data: SequenceData, subject: Subject, own: SequenceFit
 ) -> Tracking:
     """The tracking of one sequence from a fit to landmarks."""
-    views = shot.views
-    residuals = torch.full((len(shot.valid), len(own.cameras)), torch.nan)
+    views, model, settings = data.views, problem.model, problem.settings
+    residuals = torch.full((len(data.valid), len(own.cameras)), torch.nan)
     distances = all_landmarks(model, views, own, settings).residuals(own.state, subject, own.cameras)
-    residuals[shot.valid.nonzero()[views.row, 0], views.camera] = distances.median(1).values.float()
-    face = fill_gaps(model.layout.face_params(own.state, subject.identity), shot.valid)
+    residuals[data.timesteps[views.row], views.camera] = distances.median(1).values.float()
+    face = fill_gaps(model.layout.face_params(own.state, subject.identity), data.valid)
     face = replace(face, vertex_offsets=subject.vertex_offsets)
-    face = _in_world(face, shot.T_world_fit).to(torch.zeros(()))
-    cameras = shot.cameras_in_world(own.cameras)
+    if data.T_world_fit is not None:
+        R_world_fit, origin = data.T_world_fit[:3, :3], data.T_world_fit[:3, 3]
+        face = replace(
+            face,
+            head_rotation=_relative_rotation(face.head_rotation, R_world_fit),
+            head_translation=face.head_translation @ R_world_fit.T + origin,
+        )
+    face = face.to(torch.zeros(()))
+    cameras = data.cameras_in_world(own.cameras)
     return Tracking(
         face_model=face_model.name,
         face_model_hash=face_model.content_hash,
         face=face,
-        valid=shot.valid,
+        valid=data.valid,
         cameras=cameras,
         neck_lines=fit_neck_lines(face_model, face, cameras),
         residuals=residuals,
-        settings=_jsonable(dataclasses.asdict(settings)),
+        # Infinity becomes a string, because json has no infinity.
+        settings=json.loads(json.dumps(dataclasses.asdict(settings)).replace("Infinity", '"inf"')),
     )
-
-
-def _in_world(face: FaceParams, T_world_fit: Float[Tensor, "4 4"] | None) -> FaceParams:
-    if T_world_fit is None:
-        return face
-    R_world_fit, origin = T_world_fit[:3, :3], T_world_fit[:3, 3]
-    return replace(
-        face,
-        head_rotation=relative_rotation(face.head_rotation, R_world_fit),
-        head_translation=face.head_translation @ R_world_fit.T + origin,
-    )
-
-
-def _jsonable(settings: dict) -> dict:
-    """Settings as json can hold them. Infinity becomes a string, because json has no infinity."""
-    return json.loads(json.dumps(settings).replace("Infinity", '"inf"'))
 
 
 def fill_gaps(face: FaceParams, valid: Bool[Tensor, " t"]) -> FaceParams:
@@ -89,7 +78,7 @@ def fill_gaps(face: FaceParams, valid: Bool[Tensor, " t"]) -> FaceParams:
     )
 
 
-def relative_rotation(rotations: Float[Tensor, "t 3"], R_new_old: Float[Tensor, "3 3"]) -> Float[Tensor, "t 3"]:
+def _relative_rotation(rotations: Float[Tensor, "t 3"], R_new_old: Float[Tensor, "3 3"]) -> Float[Tensor, "t 3"]:
     """Axis-angle rotations in another frame, without jumps by whole turns from one timestep to the next."""
     turned = axis_angle_from_matrix(R_new_old @ matrix_from_axis_angle(rotations))
     for index in range(1, len(turned)):
@@ -99,3 +88,34 @@ def relative_rotation(rotations: Float[Tensor, "t 3"], R_new_old: Float[Tensor, 
             nearer = (other - turned[index - 1]).norm() < (turned[index] - turned[index - 1]).norm()
             turned[index] = other if nearer else turned[index]
     return turned
+
+
+def without_turn_habits(term: LandmarkTerm, subject: Subject, own: SequenceFit) -> SequenceFit:
+    """Shrink the part of a sequence's expressions that is linear in the head's turns to what one frame supports.
+
+    The fit treats errors of frames as independent. But errors of light, shape, focal length and detector follow the
+    head's turns and recur whenever the head turns the same way, and expressions that explain them move with the head.
+    So all frames together know no better than a single frame how far a coefficient follows the turns. The landmarks'
+    information of one frame is weighed against the prior of one frame: a jaw that drops as the head tips back remains,
+    and a cheek that seems to rise by half a millimetre does not. Coefficients are weighed together, so those that
+    cancel each other on the face vanish first, and lips that they close stay closed. Poses and joints do not change.
+    """
+    layout, state = term.model.layout, own.state
+    turns = _independent(state[:, :2])  # The turns up and down, left and right.
+    columns = layout.expression_columns
+    if turns.shape[1] == 0 or columns.start == columns.stop:
+        return own
+    expression, prior = state[:, columns], layout.precision[columns, columns]
+    middle = (state[:, :3] - state[:, :3].median(0).values).norm(dim=1).argmin()[None]
+    known = term.at(middle).equations(state[middle], subject, own.cameras).hessian[0, columns, columns] - prior
+    following = turns.T @ expression
+    kept = torch.linalg.solve(known + prior, known @ following.T).T
+    changed = state.clone()
+    changed[:, columns] = expression - turns @ (following - kept)
+    return replace(own, state=layout.bounds.clip(changed))
+
+
+def _independent(turns: Float[Tensor, "v 2"]) -> Float[Tensor, "v q"]:
+    """Orthonormal basis of the turns about their mean. It has fewer columns if the head hardly turns."""
+    left, lengths, _ = torch.linalg.svd(turns - turns.mean(0), full_matrices=False)
+    return left[:, lengths > _MIN_TURN * len(turns) ** 0.5]

@@ -11,7 +11,6 @@ from mien.face.chart import edge_connected, find_outside
 from mien.face.model import FaceModel
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
-_LIP_DEPTH = 0.008  # largest distance of lips from their landmarks, in metres
 _LID_WIDTH = 0.006  # largest distance of lids from their landmarks, in metres
 _MOUTH_REACH = 0.075  # largest distance of the mouth's inside from the middle of the lips, in metres
 _SOCKET_REACH = 0.025  # largest distance of a socket from its eyeball, in metres
@@ -32,7 +31,7 @@ def with_regions_by_landmarks(model: FaceModel) -> FaceModel:
     found["nose"] = _within(middle, marks[list(NOSE)], hull=True) & (middle[:, 2] > marks[list(_TEMPLES), 2].mean())
     found["brows"] = outside & (_within(middle, marks[list(_BROWS[0])]) | _within(middle, marks[list(_BROWS[1])]))
     found["eyelids"], found["eye_sockets"] = _around_eyes(model, middle, marks, outside)
-    near = _distance(middle, marks[list(LIPS)]) < _LIP_DEPTH
+    near = _distance(middle, marks[list(LIPS)]) < 0.008  # largest distance of lips from their landmarks, in metres
     found["lips"] = _within(middle, marks[list(_LIPS_OUTER)]) & near
     hidden = ~outside & ~found["lips"] & ~found["eyelids"] & ~found["eye_sockets"]
     inside = edge_connected(model.faces.numpy(), ~outside)

@@ -2,29 +2,18 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.tracking.fitting.fit import Fit, SequenceFit, Subject
-from mien.tracking.fitting.solver import (
-    Bounds,
-    NormalEquations,
-    SharedEquations,
-    join_frames,
-    join_shared,
-    place_shared,
-    solve_arrow,
-)
-from mien.tracking.landmarks.detector_response import DetectorResponse
+from mien.tracking.fitting.fit import Fit, SequenceFit
+from mien.tracking.fitting.solver import join_frames, join_shared, place_shared, solve_arrow
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS
 from mien.tracking.landmarks.term import LandmarkTerm, move_subject
 from mien.tracking.settings import TrackingSettings
 
-_SHARED_ROUNDS = 4  # rounds in which identity and offsets are fitted in turn
-_SHARED_ITERATIONS = 6  # iterations of each of these rounds
 _FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length. The prior counts once for each keyframe. Measured: 0.15 to
 1.5 change the focal length from 0.64 to 0.71 of the truth, and no error (log, "Focal length")."""
@@ -32,27 +21,14 @@ _RIM_BIAS_SHARE = 0.25
 """Standard deviation of the static offset for lids and lips, as a share of that of other landmarks."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Joint:
-    """A candidate of the joint fit, with the logarithms of the free focal lengths relative to the start."""
-
-    fit: Fit
-    log_focals: Float[Tensor, " g"]
-
-
 def fit_shared(
     terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
     """Fit identity, landmark bias and unknown focal lengths jointly with the keyframes' own parameters.
 
-    Args:
-        terms: The landmark term of each sequence, over its keyframes.
-        fit: The fit so far, at the keyframes.
-        lenses: The lens of each sequence. Sequences with the same number share one focal length, up to the size of
-            their pictures. None is a known focal length, which is kept.
-        settings: Settings with the weights of the priors.
+    Terms and fit are those of the keyframes. `lenses` are those of `Problem`.
     """
-    for _ in range(_SHARED_ROUNDS):
+    for _ in range(4):
         fit = _fit_jointly(terms, fit, lenses, settings)
         fit = fit_bias(terms, fit)
     return fit
@@ -61,23 +37,35 @@ def fit_shared(
 def _fit_jointly(
     terms: Sequence[LandmarkTerm], start: Fit, lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
-    bounds, damping = terms[0].model.layout.bounds, 1e-3
-    precision = precision_of_shared(start, lenses, settings)
-    free = len(precision) - len(start.subject.shared)
-    at = _Joint(start, start.subject.identity.new_zeros(free))
-    best = joint_cost(terms, at.fit, precision, _shared_values(at))
-    for _ in range(_SHARED_ITERATIONS):
-        frames, shared = _equations(terms, at.fit, lenses, free)
-        shared = shared.with_prior(precision, _shared_values(at))
-        state = torch.cat([own.state for own in at.fit.sequences])
-        step, shared_step = solve_arrow(frames, shared, bounds.held(state, frames.gradient), damping)
-        candidate = _move(at, step, shared_step, start, lenses, bounds, terms[0].model.response)
-        candidate_cost = joint_cost(terms, candidate.fit, precision, _shared_values(candidate))
-        if candidate_cost < best:
-            at, best, damping = candidate, candidate_cost, damping / 5
+    model, damping = terms[0].model, 1e-3
+    precision, size = precision_of_shared(start, lenses, settings), len(start.subject.shared)
+    free = len(precision) - size
+    fit, values = start, torch.cat([start.subject.shared, start.subject.identity.new_zeros(free)])
+    best = joint_cost(terms, fit, precision, values)
+    for _ in range(6):
+        parts = [
+            term.joint_equations(sequence.state, fit.subject, sequence.cameras)
+            for term, sequence in zip(terms, fit.sequences, strict=True)
+        ]
+        frames = join_frames([part for part, _ in parts])
+        shared = join_shared([place_shared(part, lens, free) for (_, part), lens in zip(parts, lenses, strict=True)])
+        state = torch.cat([sequence.state for sequence in fit.sequences])
+        held = model.layout.bounds.held(state, frames.gradient)
+        step, shared_step = solve_arrow(frames, shared.with_prior(precision, values), held, damping)
+        log_focals, sequences = values[size:] + shared_step[size:], []
+        steps = step.split([len(sequence.state) for sequence in fit.sequences])
+        for sequence, first, own_step, lens in zip(fit.sequences, start.sequences, steps, lenses, strict=True):
+            factor = 1.0 if lens is None else math.exp(float(log_focals[lens]))
+            moved = model.layout.bounds.clip(sequence.state + own_step)
+            sequences.append(SequenceFit(first.cameras.with_focal(factor), moved))
+        candidate = Fit(move_subject(fit.subject, shared_step[:size], model.response), tuple(sequences))
+        candidate_values = torch.cat([candidate.subject.shared, log_focals])
+        cost = joint_cost(terms, candidate, precision, candidate_values)
+        if cost < best:
+            fit, values, best, damping = candidate, candidate_values, cost, damping / 5
         else:
             damping *= 10
-    return at.fit
+    return fit
 
 
 def joint_cost(
@@ -99,43 +87,6 @@ def precision_of_shared(fit: Fit, lenses: Sequence[int | None], settings: Tracki
     keyframes = [sum(len(own.state) for own, lens in zip(fit.sequences, lenses, strict=True) if lens == group)
                  for group in groups]  # fmt: skip
     return torch.cat([subject, subject.new_tensor(keyframes) * _FOCAL_SIGMA**-2])
-
-
-def _shared_values(at: _Joint) -> Float[Tensor, " s"]:
-    return torch.cat([at.fit.subject.shared, at.log_focals])
-
-
-def _equations(
-    terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], free: int
-) -> tuple[NormalEquations, SharedEquations]:
-    """The equations of the timesteps of all sequences in a row, and of the shared parameters and free focal lengths."""
-    frames, shared = [], []
-    for term, own, lens in zip(terms, fit.sequences, lenses, strict=True):
-        own_frames, own_shared = term.joint_equations(own.state, fit.subject, own.cameras)
-        frames.append(own_frames)
-        shared.append(place_shared(own_shared, lens, free))
-    return join_frames(frames), join_shared(shared)
-
-
-def _move(
-    at: _Joint,
-    step: Float[Tensor, "v p"],
-    shared_step: Float[Tensor, " s"],
-    start: Fit,
-    lenses: Sequence[int | None],
-    bounds: Bounds,
-    response: DetectorResponse,
-) -> _Joint:
-    subject: Subject = at.fit.subject
-    own_steps = len(subject.shared)
-    log_focals = at.log_focals + shared_step[own_steps:]
-    steps = step.split([len(own.state) for own in at.fit.sequences])
-    sequences = []
-    for own, first, own_step, lens in zip(at.fit.sequences, start.sequences, steps, lenses, strict=True):
-        factor = 1.0 if lens is None else math.exp(float(log_focals[lens]))
-        sequences.append(SequenceFit(first.cameras.with_focal(factor), bounds.clip(own.state + own_step)))
-    subject = move_subject(subject, shared_step[:own_steps], response)
-    return _Joint(Fit(subject, tuple(sequences)), log_focals)
 
 
 def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit) -> Fit:

@@ -8,228 +8,221 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.machine.progress import progress_bar
+from mien.rotation import axis_angle_from_matrix
 from mien.tracking.fitting.fit import (
-    Course,
     Fit,
+    Progress,
     SequenceFit,
     Subject,
-    Watch,
     choose_keyframes,
     fit_of,
-    smoothness_of,
+    show_progress,
     widen,
 )
-from mien.tracking.fitting.resume import StageCache
-from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.parameters import pose_only
 from mien.tracking.fitting.solver import Smoothness, minimize_frames, solve_chain
-from mien.tracking.fitting.views import CameraBatch
-from mien.tracking.landmarks.head_pose import fit_head_pose
+from mien.tracking.fitting.views import CameraBatch, Views
+from mien.tracking.landmarks.groups import rigid_weights
 from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.problem import Problem
 from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared
-from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, unknown_subject
+from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, landmark_term, unknown_subject
 from mien.tracking.settings import TrackingSettings
 
-_FRAME_ITERATIONS = 12  # number of iterations of the fit of single frames
-_SEQUENCE_ROUNDS = 2  # rounds of the fit over time, with new turn habits in each
+FIRST_OUTLIER = 40.0  # outlier threshold of the first head pose, in standard deviations
+_SEQUENCE_ROUNDS = 2  # times that the fit over time alternates with the fit of the landmarks' bias
 _SEQUENCE_ITERATIONS = 10  # largest number of iterations of the fit over time, in all rounds together
 
 FRAMES_AT_ONCE = 512
 """Number of timesteps fitted in one batch, which takes about 100 MB of memory."""
-_LINE_SEARCH = (1.0, 0.5, 0.25, 0.1)
 _COSTS = {"head pose": 10, "identity": 10, "frames": 140, "sequence": 100}
 """Relative duration of each stage per timestep, for the progress bar, as in a clip of 15,000; multiples of ten."""
 
 
-def fit_landmarks(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    settings: TrackingSettings,
-    cache: StageCache,
-    watch: Watch,
-) -> Fit:
+def fit_landmarks(problem: Problem) -> Fit:
     """Fit all sequences of a subject to their landmarks.
 
     The stages are the head pose of every timestep alone, identity and unknown focal lengths from keyframes
     (`fit_shared`), every timestep alone, and all timesteps of each sequence together, smooth over time.
-
-    Args:
-        model: The face model reduced to its landmarks.
-        shots: The sequences.
-        lenses: Index of each sequence's unknown focal length (`lenses_of`).
-        settings: Settings of the whole tracking.
-        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
-        watch: Receives the progress.
     """
-    frames = sum(int(shot.valid.sum()) for shot in shots)
-    total = frames * sum(_COSTS.values())
-    with progress_bar("Tracking", total=total) as bar:
-        course = Course("landmarks", total, bar, watch)
-        known = fit_of(cache.get_or_compute("identity", lambda: _identify(model, shots, lenses, settings, course)))
-        course.advance(frames * _COSTS["identity"], "identity")
-        cameras = [key.cameras for key in known.sequences]
-        return _fit_motion(model, shots, cameras, known.subject, settings, cache, course)
+    total = problem.frames * sum(_COSTS.values())
+    with show_progress("Tracking", "landmarks", total, problem.callback) as progress:
+        start = fit_of(problem.cache.get_or_compute("identity", lambda: _identify(problem, progress).tensors()))
+        progress.advance(problem.frames * _COSTS["identity"], "identity")
+        return _fit_motion(problem, start.subject, [sequence.cameras for sequence in start.sequences], progress)
 
 
-def follow_landmarks(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    cameras: Sequence[CameraBatch],
-    subject: Subject,
-    settings: TrackingSettings,
-    cache: StageCache,
-    watch: Watch,
-) -> Fit:
-    """Fit only the motion of sequences to their landmarks. The subject and the cameras stay as they are.
+def follow_landmarks(problem: Problem, subject: Subject, cameras: Sequence[CameraBatch]) -> Fit:
+    """Fit only the motion of sequences to their landmarks. The subject and the cameras stay as they are."""
+    total = problem.frames * (_COSTS["frames"] + _COSTS["sequence"])
+    with show_progress("Tracking held-out sequences", "landmarks", total, problem.callback) as progress:
+        return _fit_motion(problem, subject, cameras, progress, fixed_subject=True)
 
-    Args:
-        model: The face model reduced to its landmarks.
-        shots: The sequences.
-        cameras: The cameras of each sequence, in the frame of its shot.
-        subject: The person, as other sequences show them.
-        settings: Settings of the whole tracking.
-        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
-        watch: Receives the progress.
-    """
-    total = sum(int(shot.valid.sum()) for shot in shots) * (_COSTS["frames"] + _COSTS["sequence"])
-    with progress_bar("Tracking held-out sequences", total=total) as bar:
-        course = Course("landmarks", total, bar, watch)
-        return _fit_motion(model, shots, cameras, subject, settings, cache, course, fixed_subject=True)
+
+def _identify(problem: Problem, progress: Progress) -> Fit:
+    """Fit the head poses of all timesteps, then identity and unknown focal lengths to keyframes."""
+    model, settings = problem.model, problem.settings
+    subject, starts = unknown_subject(model), []
+    for data in problem.data:
+        pose = fit_head_pose(model, data.views, data.cameras, subject, settings)
+        starts.append(SequenceFit(data.cameras, widen(pose, model.layout)))
+        _advance(progress, "head pose", 1, len(pose))
+    start = Fit(subject, tuple(starts))
+    progress.show("identity", lambda: start)
+    chosen = [choose_keyframes(sequence.state[:, :6], settings.keyframes) for sequence in starts]
+    terms = [term.at(rows) for term, rows in zip(problem.landmark_terms(start), chosen, strict=True)]
+    keyframes = [replace(each, state=each.state[rows]) for each, rows in zip(starts, chosen, strict=True)]
+    return fit_shared(terms, Fit(subject, tuple(keyframes)), problem.lenses, settings)
 
 
 def _fit_motion(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    cameras: Sequence[CameraBatch],
+    problem: Problem,
     subject: Subject,
-    settings: TrackingSettings,
-    cache: StageCache,
-    course: Course,
+    cameras: Sequence[CameraBatch],
+    progress: Progress,
     fixed_subject: bool = False,
 ) -> Fit:
     """Fit every timestep alone, then all timesteps of each sequence together."""
-    terms, sequences = [], []
-    for number, (shot, own_cameras) in enumerate(zip(shots, cameras, strict=True)):
-        pose = fit_head_pose(model, shot.views, own_cameras, subject, settings)
-        own = SequenceFit(own_cameras, widen(pose, model.layout))
-        terms.append(all_landmarks(model, shot.views, own, settings))
-        advance_frames, name = partial(_advance, course, "frames", 1), f"frames-{number}"
-        sequences.append(fit_frames(terms[-1], subject, own, advance_frames, cache, name))
+    model, settings, terms, sequences = problem.model, problem.settings, [], []
+    for number, (data, batch) in enumerate(zip(problem.data, cameras, strict=True)):
+        pose = fit_head_pose(model, data.views, batch, subject, settings)
+        start = SequenceFit(batch, widen(pose, model.layout))
+        terms.append(all_landmarks(model, data.views, start, settings))
+        sequences.append(_fit_frames(problem, terms[-1], subject, start, f"frames-{number}", progress))
+    fit = Fit(subject, tuple(sequences))
+    progress.show("sequence", lambda: Fit(subject, tuple(sequences)))
+    smoothness, advance = problem.smoothness(fit), partial(_advance, progress, "sequence", _SEQUENCE_ITERATIONS)
 
-    alone = Fit(subject, tuple(sequences))
-    course.show("sequence", lambda: alone)
-    smoothness = [smoothness_of(model.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-                  for shot, own in zip(shots, sequences, strict=True)]  # fmt: skip
-    advance = partial(_advance, course, "sequence", _SEQUENCE_ITERATIONS)
-    return fit_sequences(terms, alone, smoothness, advance, cache, fixed_subject)
+    def alternate(fit: Fit) -> dict[str, Tensor]:
+        fit = fit if fixed_subject else fit_bias(terms, fit)
+        parts = zip(terms, fit.sequences, smoothness, strict=True)
+        return replace(fit, sequences=tuple(_fit_chain(*part, fit.subject, advance) for part in parts)).tensors()
+
+    for number in range(_SEQUENCE_ROUNDS):
+        fit = fit_of(problem.cache.get_or_compute(f"sequence-{number}", partial(alternate, fit)))
+    return fit
 
 
-def _advance(course: Course, stage: str, parts: int, timesteps: int) -> None:
+def _advance(progress: Progress, stage: str, parts: int, timesteps: int) -> None:
     """Report that one of the `parts` of a stage's work at some timesteps is done."""
-    course.advance(timesteps * _COSTS[stage] // parts, stage)
+    progress.advance(timesteps * _COSTS[stage] // parts, stage)
 
 
-def _identify(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    settings: TrackingSettings,
-    course: Course,
-) -> dict[str, Tensor]:
-    """Fit the head poses of all timesteps, then identity and unknown focal lengths to keyframes; the fit as tensors."""
-    subject, starts = unknown_subject(model), []
-    for shot in shots:
-        pose = fit_head_pose(model, shot.views, shot.cameras, subject, settings)
-        starts.append(SequenceFit(shot.cameras, widen(pose, model.layout)))
-        _advance(course, "head pose", 1, len(pose))
-    course.show("identity", lambda: Fit(subject, tuple(starts)))
-    terms, keyframes = [], []
-    for shot, own in zip(shots, starts, strict=True):
-        chosen = choose_keyframes(own.state[:, :6], settings.keyframes)
-        terms.append(all_landmarks(model, shot.views, own, settings).at(chosen))
-        keyframes.append(replace(own, state=own.state[chosen]))
-    return fit_shared(terms, Fit(subject, tuple(keyframes)), lenses, settings).tensors()
-
-
-def fit_frames(
-    term: LandmarkTerm,
-    subject: Subject,
-    own: SequenceFit,
-    advance: Callable[[int], None] = lambda timesteps: None,
-    cache: StageCache | None = None,
-    name: str = "frames",
+def _fit_frames(
+    problem: Problem, term: LandmarkTerm, subject: Subject, start: SequenceFit, name: str, progress: Progress
 ) -> SequenceFit:
-    """Fit pose, expression and eyes at every timestep alone. `advance` receives the number of finished timesteps."""
-    cache, parts = cache or StageCache(), []
+    """Fit pose, expression and eyes at every timestep alone. Batches are kept under names that begin with `name`."""
 
     def fitted(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
         part = term.at(rows)
         state = minimize_frames(
-            lambda state: part.equations(state, subject, own.cameras),
-            lambda state: part.cost(state, subject, own.cameras),
-            own.state[rows], term.model.layout.bounds, _FRAME_ITERATIONS,
+            lambda state: part.equations(state, subject, start.cameras),
+            lambda state: part.cost(state, subject, start.cameras),
+            start.state[rows], term.model.layout.bounds, iterations=12,
         )  # fmt: skip
         return {"state": state}
 
-    for index, rows in enumerate(torch.arange(len(own.state)).split(FRAMES_AT_ONCE)):
-        parts.append(cache.get_or_compute(f"{name}-{index}", partial(fitted, rows))["state"])
-        advance(len(rows))
-    return replace(own, state=torch.cat(parts))
-
-
-def fit_sequences(
-    terms: Sequence[LandmarkTerm],
-    fit: Fit,
-    smoothness: Sequence[Smoothness],
-    advance: Callable[[int], None] = lambda timesteps: None,
-    cache: StageCache | None = None,
-    fixed_subject: bool = False,
-) -> Fit:
-    """Fit all timesteps of each sequence together under its smoothness cost, in turn with the landmarks' bias.
-
-    `advance` receives the number of finished timesteps in each of the iterations. If the subject is fixed, the bias
-    stays as it is.
-    """
-    cache = cache or StageCache()
-
-    def round_from(fit: Fit) -> dict[str, Tensor]:
-        fit = fit if fixed_subject else fit_bias(terms, fit)
-        parts = zip(terms, fit.sequences, smoothness, strict=True)
-        chains = tuple(_fit_chain(term, fit.subject, own, smooth, advance) for term, own, smooth in parts)
-        return replace(fit, sequences=chains).tensors()
-
-    for number in range(_SEQUENCE_ROUNDS):
-        fit = fit_of(cache.get_or_compute(f"sequence-{number}", partial(round_from, fit)))
-    return fit
+    parts = []
+    for index, rows in enumerate(torch.arange(len(start.state)).split(FRAMES_AT_ONCE)):
+        parts.append(problem.cache.get_or_compute(f"{name}-{index}", partial(fitted, rows))["state"])
+        _advance(progress, "frames", 1, len(rows))
+    return replace(start, state=torch.cat(parts))
 
 
 def _fit_chain(
-    term: LandmarkTerm,
-    subject: Subject,
-    own: SequenceFit,
-    smoothness: Smoothness,
-    advance: Callable[[int], None],
+    term: LandmarkTerm, start: SequenceFit, smoothness: Smoothness, subject: Subject, advance: Callable[[int], None]
 ) -> SequenceFit:
-    bounds = term.model.layout.bounds
+    """Fit all timesteps of a sequence together, by Gauss-Newton steps with a line search."""
+    bounds, cameras = term.model.layout.bounds, start.cameras
     iterations = _SEQUENCE_ITERATIONS // _SEQUENCE_ROUNDS
 
     def cost(state: Float[Tensor, "v p"]) -> float:
-        return float(term.cost(state, subject, own.cameras).sum() + smoothness.cost(state))
+        return float(term.cost(state, subject, cameras).sum() + smoothness.cost(state))
 
-    def step_from(state: Float[Tensor, "v p"]) -> Float[Tensor, "v p"]:
-        equations = term.equations(state, subject, own.cameras)
-        held = bounds.held(state, equations.gradient + smoothness.gradient(state))
-        return solve_chain(equations, smoothness, state, held)
-
-    state, best = own.state, cost(own.state)
+    state, best = start.state, cost(start.state)
     for done in range(iterations):
-        step = step_from(state)
-        candidates = (bounds.clip(state + fraction * step) for fraction in _LINE_SEARCH)
+        equations = term.equations(state, subject, cameras)
+        held = bounds.held(state, equations.gradient + smoothness.gradient(state))
+        step = solve_chain(equations, smoothness, state, held)
+        candidates = (bounds.clip(state + fraction * step) for fraction in (1.0, 0.5, 0.25, 0.1))
         improved = next(((c, value) for c in candidates if (value := cost(c)) < best), None)
         converged = improved is None or best - improved[1] < 1e-4 * best
         state, best = improved or (state, best)
         advance(len(state) * (iterations - done if converged else 1))
         if converged:
             break
-    return replace(own, state=state)
+    return replace(start, state=state)
+
+
+def fit_head_pose(
+    model: LandmarkModel, views: Views, cameras: CameraBatch, subject: Subject, settings: TrackingSettings
+) -> Float[Tensor, "v 6"]:
+    """Fit head rotation and translation at each timestep alone, from landmarks that expressions hardly move.
+
+    Each picture is fitted by itself first, starting from a head that faces its camera. If several cameras see a
+    timestep, their joint fit starts from the one of these poses that suits all of them best.
+    """
+    weights = rigid_weights()
+    rigid = (weights > 0).nonzero()[:, 0]
+    model = model.at(rigid, pose_only(model.layout))
+    views, weights = views.of_landmarks(rigid), weights[rigid]
+    subject = replace(subject, bias=subject.bias[rigid])
+    at_rest = model.layout.face_params(views.detected.new_zeros(1, 6), subject.identity)
+    points = model.head_points(at_rest, subject.bias)[0][0]
+
+    def fit_term(views: Views, state: Float[Tensor, "v 6"]) -> LandmarkTerm:
+        return replace(landmark_term(model, views, weights, state, cameras, settings), outlier=FIRST_OUTLIER)
+
+    def minimize(term: LandmarkTerm, start: Float[Tensor, "v 6"]) -> Float[Tensor, "v 6"]:
+        return minimize_frames(
+            lambda state: term.equations(state, subject, cameras), lambda state: term.cost(state, subject, cameras),
+            start, model.layout.bounds, iterations=15,
+        )  # fmt: skip
+
+    alone = views.apart()
+    start = _facing_the_cameras(points, alone.detected, cameras[alone.camera])
+    poses = minimize(fit_term(alone, start), start)
+    if len(poses) == views.rows:
+        return poses
+    term = fit_term(views, poses[_first_picture(views)])
+    return minimize(term, _best_for_all(term, poses, subject, cameras))
+
+
+def _facing_the_cameras(
+    points: Float[Tensor, "l 3"], detected: Float[Tensor, "n l 2"], cameras: CameraBatch
+) -> Float[Tensor, "n 6"]:
+    """Head poses that look straight into each picture's camera and match the size and place of the detected points."""
+    center = detected.mean(1)
+    spread = (detected - center[:, None]).norm(dim=-1).mean(1)
+    focal = cameras.K[:, 0, 0]
+    depth = focal * (points - points.mean(0))[:, :2].norm(dim=-1).mean() / spread
+    across = (center - cameras.K[:, :2, 2]) / focal[:, None] * depth[:, None]
+    in_camera = torch.cat([across, depth[:, None]], dim=1)
+    R_world_camera = cameras.viewmat[:, :3, :3].mT
+    in_world = (R_world_camera @ (in_camera - cameras.viewmat[:, :3, 3])[..., None])[..., 0]
+    R_world_head = R_world_camera @ torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(points)
+    return torch.cat([axis_angle_from_matrix(R_world_head), in_world - R_world_head @ points.mean(0)], dim=1)
+
+
+def _first_picture(views: Views) -> Tensor:
+    """The index of the first picture of each timestep."""
+    first = torch.zeros(views.rows, dtype=torch.long)
+    first[views.row.flip(0)] = torch.arange(len(views.row) - 1, -1, -1)
+    return first
+
+
+def _best_for_all(
+    term: LandmarkTerm, poses: Float[Tensor, "n 6"], subject: Subject, cameras: CameraBatch
+) -> Float[Tensor, "v 6"]:
+    """For each timestep, the pose that fits all of its pictures best, out of the poses fitted to single pictures."""
+    views = term.views
+    best = poses[_first_picture(views)]
+    lowest = term.cost(best, subject, cameras)
+    for camera in views.camera.unique():
+        own = views.camera == camera
+        candidate = best.clone()
+        candidate[views.row[own]] = poses[own]
+        cost = term.cost(candidate, subject, cameras)
+        better = cost < lowest
+        best, lowest = torch.where(better[:, None], candidate, best), torch.where(better, cost, lowest)
+    return best

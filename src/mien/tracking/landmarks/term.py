@@ -16,12 +16,14 @@ from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_
 from mien.tracking.landmarks.model import LandmarkModel, Linearization
 from mien.tracking.settings import TrackingSettings
 
+LANDMARK_SIGMA = 0.0015  # expected error of a landmark, in metres on the face
+_OUTLIER = 6.0  # number of these sigmas beyond which a landmark's pull fades
 _SIDEWAYS_ANGLE = 0.3
 """Angle between the direction of the face and the camera at which a picture counts half if there are several cameras,
 in radians. Measured: 0.25 to 0.7 have the same error to 0.04 mm, and smaller angles better blinks (log, "Several
 cameras in the fit")."""
 
-CHUNK = 48
+LINEARIZED = 48
 """Number of pictures linearised at once, which takes about 100 MB of memory."""
 PROJECTED = 512
 """Number of pictures projected at once, which takes about as much memory."""
@@ -102,8 +104,8 @@ class LandmarkTerm:
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
     ) -> "Iterator[WeightedLinearization]":
         """Yield linearisations of all pictures, a bounded number at a time."""
-        for start in range(0, len(self.views.row), CHUNK):
-            pictures = self.views.some(slice(start, start + CHUNK))
+        for start in range(0, len(self.views.row), LINEARIZED):
+            pictures = self.views.some(slice(start, start + LINEARIZED))
             seen, place = pictures.row.unique(return_inverse=True)
             batch = cameras[pictures.camera]
             at = self.model.linearize(state[seen], subject.identity, subject.bias, batch, place, with_identity)
@@ -113,7 +115,8 @@ class LandmarkTerm:
 
     def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
         """The normal equations of each timestep on its own, with the shared parameters fixed."""
-        equations = self._prior_equations(state)
+        cost, pull = self._prior(state)
+        equations = NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
         for part in self.linearizations(state, subject, cameras):
             part.add_to(equations)
         return equations
@@ -125,7 +128,8 @@ class LandmarkTerm:
 
         The shared parameters are `Subject.shared`, then the logarithm of the focal length.
         """
-        equations = self._prior_equations(state)
+        cost, pull = self._prior(state)
+        equations = NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
         size = len(subject.shared) + 1
         shared = SharedEquations(
             state.new_zeros(*state.shape, size), state.new_zeros(size, size), state.new_zeros(size)
@@ -134,10 +138,6 @@ class LandmarkTerm:
             part.add_to(equations)
             part.add_to_shared(shared)
         return equations, shared
-
-    def _prior_equations(self, state: Float[Tensor, "v p"]) -> NormalEquations:
-        cost, pull = self._prior(state)
-        return NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,9 +195,9 @@ def landmark_term(
     sigma = torch.ones_like(origin)
     for camera in views.camera.unique():
         middle = depth[views.camera == camera].median()
-        sigma[camera] = settings.landmark_sigma * cameras.K[camera, 0, 0] / middle
+        sigma[camera] = LANDMARK_SIGMA * cameras.K[camera, 0, 0] / middle
     weights = weights * (settings.independent_landmarks / weights.sum())
-    return LandmarkTerm(model, views, weights, sigma, settings.outlier)
+    return LandmarkTerm(model, views, weights, sigma, _OUTLIER)
 
 
 def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
@@ -222,11 +222,6 @@ def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) ->
     In pictures from the side a detector guesses the far half of the face, and its landmarks of the near half change
     with the view. A single camera is fully trusted, because the effect of turns on landmarks was measured for that case
     (`DetectorResponse`).
-
-    Args:
-        views: The pictures.
-        state: Parameters of the timesteps. The first six are the head's axis-angle rotation and translation (metres).
-        cameras: The cameras, in the frame of the state.
     """
     ahead = matrix_from_axis_angle(state[:, :3])[views.row, :, 2]
     sight = cameras.centers[views.camera] - state[views.row, 3:6]

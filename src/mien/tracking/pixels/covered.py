@@ -21,16 +21,11 @@ from mien.rotation import matrix_from_axis_angle
 from mien.tracking.fitting.fit import HIDING_REGIONS
 from mien.tracking.fitting.views import batch_of
 from mien.tracking.landmarks.groups import BROWS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
-from mien.tracking.pixels.comparison import window_of
-from mien.tracking.pixels.pictures import Picture, Pictures
+from mien.tracking.pixels.pictures import Picture, Pictures, window_of
+from mien.tracking.pixels.texture import LIGHT_EXTENT
 from mien.tracking.tracking import PARTS, Tracking
 
-_MOUTH_REACH = 0.014
-"""Distance from the landmarks of the lips up to which triangles belong to the mouth, in metres. Set by eye."""
-_NOSE_REACH = 0.008  # the same of the nose. Set by eye
-_EYES_REACH = 0.010  # the same of lids and brows. Set by eye
 _PICTURE_SIZE = 256  # shorter side of the pictures that are compared, in pixels
-_LIGHT_EXTENT = 0.012  # standard deviation of the blur that counts as light and is left out, in metres on the face
 _LEAST_COSINE = 0.3  # least cosine between the surface's normal and the direction to the camera of a point that counts
 _LEAST_SEEN = 0.4  # least share of a part's points that a picture must show
 _LEAST_LIKENESS = 0.35
@@ -42,7 +37,6 @@ _LEAST_LASTING = 3
 """Fewest pictures in a row that something covers. At 25 frames a second it is what `lasting` says; with fewer, one
 grimace or one turn of the head was taken for a hand."""
 _SIMILAR_TURN = 15.0  # angle in degrees between the turns of a head up to which its pictures are compared
-_LEAST_SIMILAR = 5  # fewest usual pictures of a similar turn without which a picture is not judged
 _ALIKE = 0.5  # correlation with the usual look above which a frame has a part in it
 _FLAT = 0.05
 """Share of the usual contrast below which a picture is flat, such as a phone's back: it correlates with nothing."""
@@ -53,12 +47,13 @@ found."""
 _MANY = 0.25  # share of odd pictures from which on they may be the face itself
 _CLEARLY = 0.1
 """Difference of correlations by which what moves in front of the face is less alike from picture to picture."""
-_LEAST_PICTURES = 8  # fewest pictures of a part that can tell what is usual
 _LOOK_EVERY = 0.2  # seconds between the frames that are looked at first
 _LEAST_LOOKS = 60  # least number of these frames
 
-_PLACES = {"mouth": LIPS, "nose": NOSE, "eyes": LEFT_EYELIDS + RIGHT_EYELIDS + BROWS}
-"""Landmarks of each part."""
+_PLACES = {
+    "mouth": (LIPS, 0.014), "nose": (NOSE, 0.008), "eyes": (LEFT_EYELIDS + RIGHT_EYELIDS + BROWS, 0.010),
+}  # fmt: skip
+"""Landmarks of each part, and the distance from them up to which triangles belong to it, in metres. Set by eye."""
 
 
 def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -> Bool[Tensor, "t c p"]:
@@ -78,8 +73,7 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
         stride = max(min(round(_LOOK_EVERY * capture.fps), len(timesteps) // _LEAST_LOOKS), 1)
         first = timesteps[::stride]
         looks = _looks(pictures, tracking, face_model, places, camera, first)
-        usual = [usual_look(*part) for part in looks]
-        usual = [the_face(look, *part) for look, part in zip(usual, looks, strict=True)]
+        usual = [the_face(usual_look(*part), *part) for part in looks]
         odd = [_unlike(look, *part) for look, part in zip(usual, looks, strict=True)]
         if stride > 1 and any(part.any() for part in odd):
             first = timesteps
@@ -97,12 +91,11 @@ def usual_look(
 ) -> Float[np.ndarray, "k 3"] | None:
     """The mean of the largest group of pictures that look alike; None if too few pictures agree.
 
-    Args:
-        values: Colours of the points of a part without the light; 0 where a picture does not show a point.
-        weights: 1 where a picture shows a point.
+    `values` are colours of the points of a part without the light, and `weights` are 1 where a picture shows a point.
+    Both are 0 elsewhere.
     """
     enough = weights.mean(1) >= _LEAST_SEEN
-    if enough.sum() < _LEAST_PICTURES:
+    if enough.sum() < 8:  # fewest pictures of a part that can tell what is usual
         return None
     values, weights = values[enough], weights[enough]
     flat, wide = values.reshape(len(values), -1), weights.repeat(3, axis=1)
@@ -163,18 +156,13 @@ def _compared(
 ) -> Bool[np.ndarray, " n"]:
     """The odd pictures of a part for which enough usual ones show the head from nearly the same side.
 
-    Seen from another side, a part may look odd without anything before it.
-
-    Args:
-        odd: The odd pictures.
-        weights: 1 where a picture shows a point of the part.
-        turns: The head's rotation in each picture, row by row.
+    Seen from another side, a part may look odd without anything before it. `turns` are the head's rotation matrices.
     """
     usual = ~odd & (weights.mean(1) >= _LEAST_SEEN)
     # The trace of R^T S is 1 + 2 cos of the angle between the rotations R and S.
     near = turns[odd] @ turns[usual].T >= 1 + 2 * np.cos(np.radians(_SIMILAR_TURN))
     compared = odd.copy()
-    compared[odd] = near.sum(1) >= _LEAST_SIMILAR
+    compared[odd] = near.sum(1) >= 5  # fewest usual pictures of a similar turn without which a picture is not judged
     return compared
 
 
@@ -188,9 +176,9 @@ def _points_of(face_model: FaceModel) -> list[Int[Tensor, " _"]]:
     marks = face_model.landmark_positions(face_model.template, "mediapipe")
     middle = face_model.template[face_model.faces].mean(1)
     free, places = ~face_model.region_mask(*HIDING_REGIONS), []
-    reaches = {"mouth": _MOUTH_REACH, "nose": _NOSE_REACH, "eyes": _EYES_REACH}
     for name in PARTS:
-        near = free & (torch.cdist(middle, marks[list(_PLACES[name])]).amin(1) < reaches[name])
+        landmarks, reach = _PLACES[name]
+        near = free & (torch.cdist(middle, marks[list(landmarks)]).amin(1) < reach)
         free = free & ~near
         places.append(near.nonzero()[:, 0])
     return places
@@ -238,7 +226,7 @@ def _sampled(
     mask = mask * ((shown >= 0) & skin.numpy()[shown])
     points = vertices[triangles].mean(1)
     at, depth = camera.project(points)
-    sigma = _LIGHT_EXTENT * float(camera.K[0, 0]) / max(float(depth.mean()), 1e-3)
+    sigma = LIGHT_EXTENT * float(camera.K[0, 0]) / max(float(depth.mean()), 1e-3)
     light = cv2.GaussianBlur(image * mask[..., None], (0, 0), sigma)
     light /= cv2.GaussianBlur(mask, (0, 0), sigma).clip(1e-3)[..., None]
     normals = torch.nn.functional.normalize(vertex_normals(vertices, face_model.faces)[triangles].mean(1), dim=1)

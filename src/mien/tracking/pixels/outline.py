@@ -15,16 +15,14 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.machine.parallel import map_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.render.mesh_gradients import mesh_edges
 from mien.tracking.fitting.fit import Subject
 from mien.tracking.fitting.solver import NormalEquations, SharedEquations
 from mien.tracking.fitting.views import CameraBatch, Views
-from mien.tracking.pixels.surface import SurfaceModel, by_log_focal
+from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, equations_of_pictures
 
 _OUTLINE_REACH = 0.012  # largest distance along the normal at which an edge of the matte is searched, in metres
-_OUTLINE_SAMPLES = 49  # number of samples of the matte along the normal
 _OUTLINE_BESIDE = 1.5  # distance outside of the outline, in pixels, at which there must be no mesh
 _OUTLINE_SIGMA = 0.0015  # expected distance between outline and matte, in metres. Set with the outlier thresholds
 _OUTLINE_OUTLIERS = (4.0, 2.0)
@@ -75,64 +73,39 @@ class OutlineTerm:
 
         The shared parameters are `Subject.shared`, then the logarithm of the focal length.
         """
-        size = state.shape[1] + len(subject.columns_of_pixels)
-
-        def of_row(row: int) -> tuple[float, Tensor, Tensor]:
-            posed = self.model.pose(state[row], subject.identity, derive_identity=True)
-            assert posed.jacobian is not None
-            seen_by = self.views.seen_by(row)
-            jacobian = torch.cat([posed.jacobian, by_log_focal(posed.vertices, cameras, seen_by)], dim=2)
-            cost, gradient, hessian = 0.0, torch.zeros(size).double(), torch.zeros(size, size).double()
-            for camera in seen_by:
-                slopes, distance, weights, own = self._residuals(posed.vertices, jacobian, row, camera, cameras)
-                cost += self.weight * own
-                gradient -= self.weight * (slopes.T @ (weights * distance))
-                hessian += self.weight * (slopes.T @ (weights[:, None] * slopes))
-            return cost, gradient, hessian
-
-        parts = map_in_threads(of_row, rows.tolist())
-        cost = torch.tensor([part[0] for part in parts]).double()
-        gradient, hessian = torch.stack([part[1] for part in parts]), torch.stack([part[2] for part in parts])
-        whole = NormalEquations(cost, gradient, hessian)
+        whole = equations_of_pictures(
+            self.model, self.views, state, rows, subject, cameras, self.weight, self._of_picture, shared=True
+        )
         return whole.split(state.shape[1], subject.columns_of_pixels, len(subject.shared) + 1)
 
-    def _residuals(
-        self,
-        vertices: Float[Tensor, "v 3"],
-        jacobian: Float[Tensor, "v 3 q"],
-        row: int,
-        camera: int,
-        cameras: CameraBatch,
-    ) -> tuple[Float[Tensor, "k q"], Float[Tensor, " k"], Float[Tensor, " k"], float]:
-        """Residuals of one picture.
-
-        Returns:
-            Derivatives of each point's outward motion, each point's distance to the edge, the weights, and the cost.
-        """
+    def _of_picture(
+        self, posed: PosedSurface, row: int, camera: int, cameras: CameraBatch
+    ) -> tuple[float, Float[Tensor, " q"], Float[Tensor, "q q"]]:
+        """Cost of one picture, half its gradient and half its Hessian."""
+        vertices, jacobian = posed.vertices, posed.jacobian
+        assert jacobian is not None
         size = (self.capture.width, self.capture.height)
         view = Camera(cameras.K[camera], cameras.viewmat[camera], *size).to(torch.zeros(()))
         outline = self.outline(vertices, view)
-        middle = vertices[outline.ends].mean(1) @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        x, y, z = middle.unbind(-1)
+        x, y, z = (vertices[outline.ends].mean(1) @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).unbind(-1)
         scale = float(view.K[0, 0] / vertices.new_tensor([z.median() if len(z) else 1.0]))
         matte = np.asarray(self.capture.mattes[int(self.timesteps[row]), camera])
         distance = edge_distances(matte, outline, _OUTLINE_REACH * scale)
-        seen = distance.isfinite()
-        zero = torch.zeros_like(x)
+        seen, zero = distance.isfinite(), torch.zeros_like(x)
         by_point = torch.stack([
             torch.stack([view.K[0, 0] / z, zero, -view.K[0, 0] * x / z**2], -1),
             torch.stack([zero, view.K[1, 1] / z, -view.K[1, 1] * y / z**2], -1),
         ], dim=1)  # fmt: skip
         outwards = torch.einsum("kx,kxc->kc", outline.normals, by_point) @ view.viewmat[:3, :3]
         moved = jacobian[outline.ends[:, 0]] + jacobian[outline.ends[:, 1]]
-        slopes = 0.5 * torch.einsum("kc,kcq->kq", outwards, moved)
-        sigma = _OUTLINE_SIGMA * scale
-        squared = (distance[seen] / sigma).square()
-        least = torch.where(distance[seen] < 0, *_OUTLINE_OUTLIERS) ** 2
+        slopes = (0.5 * torch.einsum("kc,kcq->kq", outwards, moved))[seen].double()
+        distance, sigma = distance[seen], _OUTLINE_SIGMA * scale
+        squared = (distance / sigma).square()
+        least = torch.where(distance < 0, *_OUTLINE_OUTLIERS) ** 2
         share = outline.lengths[seen] / outline.lengths.sum().clamp_min(1.0)
-        weights = share * (least / (least + squared)).square() / sigma**2
+        weights = (share * (least / (least + squared)).square() / sigma**2).double()
         cost = float((share * least * squared / (least + squared)).sum())
-        return slopes[seen].double(), distance[seen].double(), weights.double(), cost
+        return cost, -(slopes.T @ (weights * distance.double())), slopes.T @ (weights[:, None] * slopes)
 
     def outline(self, vertices: Float[Tensor, "v 3"], camera: Camera) -> Outline:
         """The points of the mesh's outline against the background."""
@@ -180,7 +153,7 @@ def _covered(drawn: Int[Tensor, "h w"], points: Float[Tensor, "k 2"]) -> Bool[Te
 
 def edge_distances(matte: np.ndarray, outline: Outline, reach: float) -> Float[Tensor, " k"]:
     """Distance along the normal from each point to the edge of the matte, in pixels; NaN if there is none in reach."""
-    steps = np.linspace(-reach, reach, _OUTLINE_SAMPLES, dtype=np.float32)
+    steps = np.linspace(-reach, reach, 49, dtype=np.float32)  # number of samples of the matte along the normal
     path = outline.points.numpy()[:, None] + steps[:, None] * outline.normals.numpy()[:, None]
     if not len(path):
         return torch.zeros(0)

@@ -1,4 +1,4 @@
-"""Pictures for the photometric fit: smoothed, scaled down, and masked to the pixels that can be trusted."""
+"""Pictures for the photometric fit: smoothed, scaled down, masked to the pixels that can be trusted, and cut out."""
 
 from dataclasses import dataclass
 
@@ -51,3 +51,25 @@ class Pictures:
         view = Camera(cameras.K[camera], cameras.viewmat[camera], capture.width, capture.height)
         view = view.resized(width, height).to(torch.zeros(()))
         return Picture(view, torch.from_numpy(image), torch.from_numpy(mask))
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The part of a picture that a mesh may cover. A head leaves most of a picture empty."""
+
+    camera: Camera
+    """The camera of that part alone."""
+    rows: slice
+    columns: slice
+
+
+def window_of(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Window:
+    """The window of a mesh in a picture, with a margin of 3 pixels. It is never smaller than 8 x 8 pixels."""
+    points, depth = camera.project(vertices)
+    points = points[depth > 0] if (depth > 0).any() else points.new_zeros(1, 2)
+    size = torch.tensor([camera.width, camera.height])
+    first = torch.minimum((points.amin(0).floor().long() - 3).clamp_min(0), size - 8)
+    last = torch.minimum(points.amax(0).ceil().long() + 3, size).maximum(first + 8)
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    part = camera.cropped(float(left), float(top), right - left, bottom - top)
+    return Window(part, slice(top, bottom), slice(left, right))

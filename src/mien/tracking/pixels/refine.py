@@ -9,23 +9,24 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.machine.parallel import map_in_threads
-from mien.machine.progress import progress_bar, say
-from mien.tracking.eyelids.placing import place_lids
-from mien.tracking.fitting.fit import Course, Fit, SequenceFit, Subject, Watch, smoothness_of
+from mien.machine.progress import say
+from mien.tracking.fitting.fit import Fit, Progress, SequenceFit, Subject, show_progress
 from mien.tracking.fitting.resume import StageCache
-from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.sequence import SequenceData
 from mien.tracking.fitting.solver import NormalEquations, Smoothness, solve_chain
-from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.landmarks.problem import Problem
 from mien.tracking.landmarks.shared_fit import fit_bias
-from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, quiet_landmarks
+from mien.tracking.landmarks.term import LandmarkTerm, quiet_landmarks
+from mien.tracking.pixels.eyelids import place_lids
 from mien.tracking.pixels.outline import OutlineTerm, outline_term
 from mien.tracking.pixels.pictures import Pictures
-from mien.tracking.pixels.shared import SharedPrior, step_shared
+from mien.tracking.pixels.shared import step_shared
 from mien.tracking.pixels.surface import SurfaceModel, surface_model
 from mien.tracking.pixels.term import PhotometricTerm
 from mien.tracking.pixels.texture import (
+    LIGHT_EXTENT,
     PhotometricFit,
-    Sighting,
+    SurfaceView,
     TextureSpace,
     estimate_appearance,
     even_light,
@@ -33,13 +34,18 @@ from mien.tracking.pixels.texture import (
     texture_space,
     unknown_texture,
 )
-from mien.tracking.settings import PhotometricSettings, TrackingSettings
 
 _FRAME_DAMPING = 1e-3  # damping of a frame's step, as a share of the diagonal
 _WORSE = 1.02  # a step of a frame is undone if it multiplies the frame's cost by this factor or more
+_SHARED_STEPS_OF_CAMERAS = 8
+"""Steps of identity in each iteration with several cameras. They see depth, so the shape keeps improving for longer."""
 _LEAST_KEYFRAMES = 3
 """Fewest keyframes for any number of cameras, because the mouth must be seen open and closed. Measured: with 16
 cameras, 3 are as good as 24 (log, "Several cameras in the fit")."""
+_REFERENCE_ANGLE = 0.12
+"""Head rotation from the median pose, in radians, within which frames decide the texture; others hardly count. With
+equal weights every pose would keep its own error, because the texture would reproduce it wherever only such frames see
+the skin. With several cameras all frames count alike, because each pose is seen from many sides."""
 _LEAST_SHARE = 0.03  # least weight of a frame in the texture, however far from the middle pose
 
 FRAMES_AT_ONCE = 256
@@ -50,261 +56,188 @@ appearance, in timesteps of a step of all frames. The third is how many times lo
 
 
 @dataclass(frozen=True, eq=False)
-class _Round:
-    """Data and settings that all steps of one round share."""
+class _PixelProblem:
+    """A problem with what the fit to pixels adds to it, for pictures of one size."""
 
+    problem: Problem
     model: SurfaceModel
     space: TextureSpace
-    shots: Sequence[Shot]
     landmarks: Sequence[LandmarkTerm]
     outlines: Sequence[OutlineTerm]
-    prior: SharedPrior
-    settings: PhotometricSettings
+    focals: Float[Tensor, " q"]
+    """The focal length of each sequence from the fit to landmarks, in pixels."""
     size: int
 
-    @property
-    def keyframes(self) -> int:
-        """Number of keyframes of each sequence for the steps of the shared parameters."""
-        pictures = 2 * self.settings.keyframes // max(shot.capture.valid.shape[1] for shot in self.shots)
-        return min(self.settings.keyframes, max(pictures, _LEAST_KEYFRAMES))
+    def pictures(self, data: SequenceData) -> Pictures:
+        """The pictures of a sequence at this size."""
+        return Pictures(data.capture, max(round(min(data.capture.width, data.capture.height) / self.size), 1))
 
-    def pictures(self, shot: Shot) -> Pictures:
-        """The pictures of a sequence at this round's size."""
-        return Pictures(shot.capture, max(round(min(shot.capture.width, shot.capture.height) / self.size), 1))
-
-    def light_radius(self, shot: Shot, own: SequenceFit) -> int:
+    def light_radius(self, data: SequenceData, sequence: SequenceFit) -> int:
         """Radius in pixels over which a smooth difference counts as light."""
-        cameras = own.cameras
-        depth = (own.state[:, 3:6] @ cameras.viewmat[0, 2, :3] + cameras.viewmat[0, 2, 3]).median()
-        extent = self.settings.light_extent * float(cameras.K[0, 0, 0] / depth)
-        return max(round(extent / self.pictures(shot).shrink), 2)
+        cameras = sequence.cameras
+        depth = (sequence.state[:, 3:6] @ cameras.viewmat[0, 2, :3] + cameras.viewmat[0, 2, 3]).median()
+        extent = LIGHT_EXTENT * float(cameras.K[0, 0, 0] / depth)
+        return max(round(extent / self.pictures(data).shrink), 2)
 
     def terms(self, at: PhotometricFit, independent_pixels: float) -> list[PhotometricTerm]:
         """The cost of every sequence. All pixels of a picture are worth `independent_pixels` independent ones."""
-        surface = self.space.native(at.texture, self.settings.outlier)
+        surface = self.space.native(at.texture, self.problem.settings.photometric.outlier)
         return [
             PhotometricTerm(
-                self.model, marks, self.pictures(shot), shot.valid.nonzero()[:, 0], surface, light,
-                self.light_radius(shot, own), independent_pixels, at.texture.sigma,
+                self.model, marks, self.pictures(data), data.timesteps, surface, light,
+                self.light_radius(data, sequence), independent_pixels, at.texture.sigma,
             )
-            for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
+            for data, marks, sequence, light in zip(
+                self.problem.data, self.landmarks, at.fit.sequences, at.lights, strict=True
+            )
         ]  # fmt: skip
 
     def update_appearance(self, at: PhotometricFit) -> PhotometricFit:
         """Estimate texture and light again, from the present positions of the faces."""
-        sightings = [
-            self._sightings(shot, marks, own, at.fit.subject.identity, light)
-            for shot, marks, own, light in zip(self.shots, self.landmarks, at.fit.sequences, at.lights, strict=True)
+        views = [
+            self._views(data, marks, sequence, at.fit.subject.identity, light)
+            for data, marks, sequence, light in zip(
+                self.problem.data, self.landmarks, at.fit.sequences, at.lights, strict=True
+            )
         ]
-        radius = self.light_radius(self.shots[0], at.fit.sequences[0])
-        found, lights = estimate_appearance(self.space, sightings, at.texture, self.settings.outlier, radius)
-        return replace(at, texture=found, lights=tuple(lights))
+        radius = self.light_radius(self.problem.data[0], at.fit.sequences[0])
+        outlier = self.problem.settings.photometric.outlier
+        texture, lights = estimate_appearance(self.space, views, at.texture, outlier, radius)
+        return replace(at, texture=texture, lights=tuple(lights))
 
     def step_shared(self, at: PhotometricFit) -> PhotometricFit:
         """Estimate texture and light again, then take one step of identity and unknown focal lengths."""
-        at = self.update_appearance(at)
-        terms = self.terms(at, self.settings.independent_pixels)
-        moved = step_shared(terms, self.outlines, at.fit, self.prior, self.keyframes)
+        at, settings = self.update_appearance(at), self.problem.settings.photometric
+        most = 2 * settings.keyframes // max(data.capture.valid.shape[1] for data in self.problem.data)
+        keyframes = min(settings.keyframes, max(most, _LEAST_KEYFRAMES))
+        terms = self.terms(at, settings.independent_pixels)
+        moved = step_shared(self.problem, terms, self.outlines, at.fit, self.focals, keyframes)
         return replace(at, fit=fit_bias(self.landmarks, moved))
 
-    def _sightings(
+    def _views(
         self,
-        shot: Shot,
+        data: SequenceData,
         landmarks: LandmarkTerm,
-        own: SequenceFit,
+        sequence: SequenceFit,
         identity: Float[Tensor, " i"],
         light: Float[Tensor, "9 3"],
-    ) -> list[Sighting]:
-        pictures, timesteps = self.pictures(shot), shot.valid.nonzero()[:, 0]
-        middle = own.state[:, :3].median(0).values
-        away = (own.state[:, :3] - middle).norm(dim=1) / self.settings.reference_angle
-        shares = 1 / (1 + away**4) + _LEAST_SHARE if len(own.cameras) == 1 else torch.ones_like(away)
+    ) -> list[SurfaceView]:
+        """The pictures of a sequence that the texture is estimated from."""
+        pictures, state, cameras = self.pictures(data), sequence.state, sequence.cameras
+        away = (state[:, :3] - state[:, :3].median(0).values).norm(dim=1) / _REFERENCE_ANGLE
+        shares = 1 / (1 + away**4) + _LEAST_SHARE if len(cameras) == 1 else torch.ones_like(away)
 
-        def sight(row: int) -> list[Sighting]:
-            posed = self.model.pose(own.state[row], identity, derive=False)
-            cameras = landmarks.views.seen_by(row)
+        def of_row(row: int) -> list[SurfaceView]:
+            posed = self.model.pose(state[row], identity, derive=False)
+            timestep, share = int(data.timesteps[row]), float(shares[row])
             return [
-                Sighting(
-                    posed, pictures.picture(int(timesteps[row]), camera, own.cameras), light, float(shares[row])
-                )
-                for camera in cameras
-            ]  # fmt: skip
+                SurfaceView(posed, pictures.picture(timestep, camera, cameras), light, share)
+                for camera in landmarks.views.seen_by(row)
+            ]
 
-        count = min(self.settings.texture_frames, len(own.state))
-        rows = torch.linspace(0, len(own.state) - 1, count).round().long().unique().tolist()
-        return [sighting for several in map_in_threads(sight, rows) for sighting in several]
+        count = min(48, len(state))  # frames of each sequence that the texture is estimated from
+        rows = torch.linspace(0, len(state) - 1, count).round().long().unique().tolist()
+        return [view for several in map_in_threads(of_row, rows) for view in several]
+
+    def residuals(self, at: PhotometricFit) -> PhotometricFit:
+        """The fit with the residuals of the frames that were improved."""
+        terms = self.terms(at, self.problem.settings.photometric.independent_pixels_of_frames)
+        residuals = [
+            term.residuals(sequence.state, at.fit.subject, sequence.cameras).where(improved[:, None], torch.nan)
+            for term, sequence, improved in zip(terms, at.fit.sequences, at.improved, strict=True)
+        ]
+        return replace(at, residuals=tuple(residuals))
 
 
-def refine_photometrically(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    fit: Fit,
-    settings: TrackingSettings,
-    cache: StageCache,
-    watch: Watch,
-) -> PhotometricFit:
-    """Refine a fit to landmarks until the pictures agree with one texture that they all share.
+def photometric_start(problem: Problem, fit: Fit) -> PhotometricFit:
+    """A fit to landmarks before any pixel is seen: without a texture, in even light."""
+    size = problem.settings.photometric.texture_size
+    lights = tuple(even_light() for _ in problem.data)
+    return PhotometricFit(fit, unknown_texture(size), lights, not_improved(fit))
 
-    Each round fits identity and unknown focal lengths to keyframes (from the second round on), then the albedo by
+
+def not_improved(fit: Fit) -> tuple[Bool[Tensor, " _"], ...]:
+    """`PhotometricFit.improved` of a fit that saw no pixel yet."""
+    return tuple(torch.zeros(len(sequence.state), dtype=torch.bool) for sequence in fit.sequences)
+
+
+def refine_photometrically(problem: Problem, start: PhotometricFit, known_person: bool = False) -> PhotometricFit:
+    """Refine a fit until the pictures agree with one texture that they all share.
+
+    Each iteration fits identity and unknown focal lengths to keyframes (from the second one on), then the albedo by
     robust least squares per texel in turn with the light (spherical harmonics), then takes one Gauss-Newton step of all
     timesteps of each sequence under their smoothness cost. Landmarks stay in the cost with less weight; irises, lids
     and lips need them. At the end the lids are placed from the pictures (`place_lids`). The result is deterministic.
 
-    Args:
-        model: The face model reduced to its landmarks.
-        shots: The sequences.
-        lenses: Index of each sequence's unknown focal length (`lenses_of`).
-        fit: The fit to landmarks.
-        settings: Settings of the whole tracking.
-        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
-        watch: Receives the progress.
+    If the person is known, only the motion is refined: subject, cameras, texture and light of `start` stay.
     """
-    own_settings = settings.photometric
-    rounds = _rounds(model, shots, lenses, fit, settings)
-    at = PhotometricFit(
-        fit, unknown_texture(rounds[0].space), tuple(even_light() for _ in shots),
-        tuple(torch.zeros(len(own.state), dtype=torch.bool) for own in fit.sequences),
-    )  # fmt: skip
-    frames = sum(len(own.state) for own in fit.sequences)
-    several = any(len(own.cameras) > 1 for own in fit.sequences)
-    shared_steps = own_settings.shared_steps_of_cameras if several else own_settings.shared_steps
-    total = len(rounds) * (_APPEARANCE_COST + frames) + (len(rounds) - 1) * shared_steps * _SHARED_COST
-    total += frames // _LIDS_PART
-    with progress_bar("Fitting to pixels", total=total) as bar:
-        course = Course("pixels", total, bar, watch)
-        keep = partial(_keep, cache, course)
-        for number, now in enumerate(rounds):
-            status = f"round {number + 1} of {len(rounds)}"
-            for step in range(shared_steps if number > 0 else 0):
-                at = keep(f"round-{number}-shared-{step}", f"{status}, identity", partial(now.step_shared, at))
-                course.advance(_SHARED_COST, f"{status}, identity")
-            # The name of this piece is that of earlier releases, whose pieces stay readable.
-            at = keep(f"round-{number}-looks", f"{status}, texture and light", partial(now.update_appearance, at))
-            course.advance(_APPEARANCE_COST, f"{status}, texture and light")
-            if not (at.texture.trust > 0).any():
-                name = model.face_model.name
-                say(f"{name}: the pictures show no part of its texture, so the fit to landmarks is kept")
-                return replace(at, fit=fit)
-            at = _step_round(now, at, number, status, settings, cache, course)
-        at = keep("lids", "lids", lambda: replace(at, fit=place_lids(model, shots, at.fit, own_settings.lids)))
-        course.advance(frames // _LIDS_PART, "lids")
-    return _with_residuals(rounds[0], rounds[0].update_appearance(at))
-
-
-def follow_photometrically(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    start: PhotometricFit,
-    settings: TrackingSettings,
-    cache: StageCache,
-    watch: Watch,
-) -> PhotometricFit:
-    """Refine only the motion of sequences by pixels. The subject, cameras, texture and light of `start` stay.
-
-    Args:
-        model: The face model reduced to its landmarks.
-        shots: The sequences.
-        start: Their fit to landmarks, with a texture that other sequences show, and the light of each sequence.
-        settings: Settings of the whole tracking.
-        cache: Keeps the pieces from which an interrupted fit of the same input resumes.
-        watch: Receives the progress.
-    """
-    rounds = _rounds(model, shots, [None] * len(shots), start.fit, settings)
-    frames, at = sum(len(own.state) for own in start.fit.sequences), start
-    total = len(rounds) * frames + frames // _LIDS_PART
-    with progress_bar("Fitting held-out sequences to pixels", total=total) as bar:
-        course = Course("pixels", total, bar, watch)
-        for number, now in enumerate(rounds):
-            at = _step_round(now, at, number, f"round {number + 1} of {len(rounds)}", settings, cache, course)
-        lids, before = settings.photometric.lids, at
-        at = _keep(
-            cache, course, "lids", "lids", lambda: replace(before, fit=place_lids(model, shots, before.fit, lids))
-        )
-        course.advance(frames // _LIDS_PART, "lids")
-    return _with_residuals(rounds[0], at)
-
-
-def _step_round(
-    now: _Round,
-    at: PhotometricFit,
-    number: int,
-    status: str,
-    settings: TrackingSettings,
-    cache: StageCache,
-    course: Course,
-) -> PhotometricFit:
-    """Take the step of all timesteps that ends a round."""
-    advance = partial(course.advance, status=f"{status}, frames")
-    step_all = partial(_step_sequences, now, at, settings, cache, f"step-{number}", advance)
-    at = _keep(cache, course, f"round-{number}", status, step_all)
-    cache.drop(f"step-{number}")
-    return at
+    settings, at, frames = problem.settings.photometric, start, problem.frames
+    several = any(len(sequence.cameras) > 1 for sequence in start.fit.sequences)
+    shared_steps = _SHARED_STEPS_OF_CAMERAS if several else settings.shared_steps
+    iterations = _pixel_problems(problem, start.fit)
+    total = len(iterations) * frames + frames // _LIDS_PART
+    if not known_person:
+        total += len(iterations) * _APPEARANCE_COST + (len(iterations) - 1) * shared_steps * _SHARED_COST
+    title = "Fitting held-out sequences to pixels" if known_person else "Fitting to pixels"
+    with show_progress(title, "pixels", total, problem.callback) as progress:
+        keep = partial(_keep, problem, progress)
+        for number, now in enumerate(iterations):
+            name, status = f"iteration-{number}", f"iteration {number + 1} of {len(iterations)}"
+            for step in range(0 if known_person or number == 0 else shared_steps):
+                at = keep(f"{name}-shared-{step}", f"{status}, identity", partial(now.step_shared, at))
+                progress.advance(_SHARED_COST, f"{status}, identity")
+            if not known_person:
+                at = keep(f"{name}-appearance", f"{status}, texture and light", partial(now.update_appearance, at))
+                progress.advance(_APPEARANCE_COST, f"{status}, texture and light")
+                if not (at.texture.trust > 0).any():
+                    model = problem.model.face_model.name
+                    say(f"{model}: the pictures show no part of its texture, so the fit to landmarks is kept")
+                    return replace(at, fit=start.fit)
+            advance = partial(progress.advance, status=f"{status}, frames")
+            at = keep(name, status, partial(_step_frames, now, at, f"step-{number}", advance))
+            problem.cache.drop(f"step-{number}")
+        place = partial(place_lids, problem.model, problem.data, at.fit, settings.lids)
+        at = keep("lids", "lids", lambda: replace(at, fit=place()))
+        progress.advance(frames // _LIDS_PART, "lids")
+    return iterations[0].residuals(at if known_person else iterations[0].update_appearance(at))
 
 
 def _keep(
-    cache: StageCache, course: Course, name: str, status: str, compute: Callable[[], PhotometricFit]
+    problem: Problem, progress: Progress, name: str, status: str, compute: Callable[[], PhotometricFit]
 ) -> PhotometricFit:
-    """Return the cached fit of that name, or compute it, and show it to the watch."""
-    found = photometric_fit_of(cache.get_or_compute(name, lambda: compute().tensors()))
-    course.show(status, lambda: found)
-    return found
+    """Return the cached fit of that name, or compute it, and show it."""
+    fit = photometric_fit_of(problem.cache.get_or_compute(name, lambda: compute().tensors()))
+    progress.show(status, lambda: fit)
+    return fit
 
 
-def _rounds(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    fit: Fit,
-    settings: TrackingSettings,
-) -> list[_Round]:
-    own_settings = settings.photometric
-    landmarks = [
-        quiet_landmarks(all_landmarks(model, shot.views, own, settings), own_settings.landmark_share)
-        for shot, own in zip(shots, fit.sequences, strict=True)
-    ]
-    surface = surface_model(model.face_model, model.layout)
-    space = texture_space(surface.face_model, own_settings.texture_size)
-    focals = torch.stack([own.cameras.K[0, 0, 0] for own in fit.sequences])
-    prior = SharedPrior(lenses, focals, own_settings.focal_sigma, settings.identity_weight)
+def _pixel_problems(problem: Problem, fit: Fit) -> list[_PixelProblem]:
+    """The problem of each iteration."""
+    settings = problem.settings.photometric
+    landmarks = [quiet_landmarks(term, settings.landmark_share) for term in problem.landmark_terms(fit)]
+    surface = surface_model(problem.model.face_model, problem.model.layout)
+    space = texture_space(surface.face_model, settings.texture_size)
+    focals = torch.stack([sequence.cameras.K[0, 0, 0] for sequence in fit.sequences])
     outlines = [
         outline_term(
-            surface, shot.capture, shot.valid.nonzero()[:, 0], shot.views,
-            own_settings.outline_weight if len(shot.cameras) == 1 else 0.0,  # Several cameras see depth without it.
+            surface, data.capture, data.timesteps, data.views,
+            settings.outline_weight if len(data.cameras) == 1 else 0.0,  # Several cameras see depth without it.
         )
-        for shot in shots
+        for data in problem.data
     ]  # fmt: skip
-    return [
-        _Round(surface, space, shots, landmarks, outlines, prior, own_settings, size) for size in own_settings.sizes
-    ]
+    return [_PixelProblem(problem, surface, space, landmarks, outlines, focals, size) for size in settings.sizes]
 
 
-def _with_residuals(now: _Round, at: PhotometricFit) -> PhotometricFit:
-    found = [
-        term.residuals(own.state, at.fit.subject, own.cameras).where(improved[:, None], torch.nan)
-        for term, own, improved in zip(
-            now.terms(at, now.settings.independent_pixels_of_frames), at.fit.sequences, at.improved, strict=True
-        )
-    ]
-    return replace(at, residuals=tuple(found))
-
-
-def _step_sequences(
-    now: _Round,
-    at: PhotometricFit,
-    settings: TrackingSettings,
-    cache: StageCache,
-    name: str,
-    advance: Callable[[int], None],
-) -> PhotometricFit:
+def _step_frames(now: _PixelProblem, at: PhotometricFit, name: str, advance: Callable[[int], None]) -> PhotometricFit:
     """Take one step of all timesteps of every sequence. Its pieces are kept under names that begin with `name`."""
-    sequences, improved = [], []
-    terms = now.terms(at, now.settings.independent_pixels_of_frames)
-    parts = zip(terms, now.shots, at.fit.sequences, at.improved, strict=True)
-    for number, (term, shot, own, before) in enumerate(parts):
-        smoothness = smoothness_of(term.layout, shot.valid, shot.fps, settings.smoothness, own.cameras)
-        state, better = _step(term, at.fit.subject, own, smoothness, cache, f"{name}-{number}", advance)
-        sequences.append(replace(own, state=state))
+    sequences, improved, problem = [], [], now.problem
+    terms = now.terms(at, problem.settings.photometric.independent_pixels_of_frames)
+    parts = zip(terms, at.fit.sequences, problem.smoothness(at.fit), at.improved, strict=True)
+    for number, (term, sequence, smoothness, before) in enumerate(parts):
+        pieces = f"{name}-{number}-equations"
+        equations = _equations(term, at.fit.subject, sequence, problem.cache, pieces, advance)
+        state, better = _step(term, at.fit.subject, sequence, equations, smoothness)
+        sequences.append(replace(sequence, state=state))
         improved.append(before | better)
     return replace(at, fit=replace(at.fit, sequences=tuple(sequences)), improved=tuple(improved))
 
@@ -312,42 +245,34 @@ def _step_sequences(
 def _equations(
     term: PhotometricTerm,
     subject: Subject,
-    own: SequenceFit,
+    sequence: SequenceFit,
     cache: StageCache,
     name: str,
     advance: Callable[[int], None],
 ) -> NormalEquations:
-    """The equations of all timesteps, computed in pieces. Pieces that an interrupted fit has kept are read."""
+    """The equations of all timesteps, computed in pieces, of which the whole is the only copy in memory."""
 
-    def made(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
-        found = term.equations(own.state, rows, subject, own.cameras)
-        return {"cost": found.cost, "gradient": found.gradient, "hessian": found.hessian}
+    def computed(rows: Int[Tensor, " k"]) -> dict[str, Tensor]:
+        return vars(term.equations(sequence.state, rows, subject, sequence.cameras))
 
-    v, p = own.state.shape
-    whole = {"cost": own.state.new_empty(v), "gradient": own.state.new_empty(v, p),
-             "hessian": own.state.new_empty(v, p, p)}  # fmt: skip
+    v, p = sequence.state.shape
+    whole = {key: sequence.state.new_empty(shape) for key, shape in
+             (("cost", (v,)), ("gradient", (v, p)), ("hessian", (v, p, p)))}  # fmt: skip
     for index, rows in enumerate(torch.arange(v).split(FRAMES_AT_ONCE)):
-        for key, part in cache.get_or_compute(f"{name}-equations-{index}", partial(made, rows)).items():
+        for key, part in cache.get_or_compute(f"{name}-{index}", partial(computed, rows)).items():
             whole[key][rows] = part
         advance(len(rows))
     return NormalEquations(**whole)
 
 
 def _step(
-    term: PhotometricTerm,
-    subject: Subject,
-    own: SequenceFit,
-    smoothness: Smoothness,
-    cache: StageCache,
-    name: str,
-    advance: Callable[[int], None],
+    term: PhotometricTerm, subject: Subject, sequence: SequenceFit, equations: NormalEquations, smoothness: Smoothness
 ) -> tuple[Float[Tensor, "v p"], Bool[Tensor, " v"]]:
     """Move all timesteps by one Gauss-Newton step, except those that it makes worse; also returns which ones moved."""
-    bounds, state = term.layout.bounds, own.state
-    equations = _equations(term, subject, own, cache, name, advance)
+    bounds, state = term.layout.bounds, sequence.state
     damping = torch.diag_embed(_FRAME_DAMPING * equations.hessian.diagonal(dim1=1, dim2=2))
     held = bounds.held(state, equations.gradient + smoothness.gradient(state))
     damped = replace(equations, hessian=equations.hessian + damping)
     candidate = bounds.clip(state + solve_chain(damped, smoothness, state, held))
-    better = term.costs(candidate, subject, own.cameras) < _WORSE * equations.cost
+    better = term.costs(candidate, subject, sequence.cameras) < _WORSE * equations.cost
     return torch.where(better[:, None], candidate, state), better

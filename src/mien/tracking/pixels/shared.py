@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from mien.tracking.fitting.fit import Fit, SequenceFit, choose_keyframes
 from mien.tracking.fitting.solver import join_frames, join_shared, place_shared, solve_arrow
+from mien.tracking.landmarks.problem import Problem
 from mien.tracking.landmarks.term import move_subject
 from mien.tracking.pixels.outline import OutlineTerm
 from mien.tracking.pixels.term import PhotometricTerm
@@ -18,61 +18,46 @@ _SHARED_DAMPING = 1e-6
 """Damping of a step of identity and focal length. It is tiny, because the effect that separates focal length from depth
 is a thousandth of the effect of either alone. Measured: 1e-3 keeps the focal length where it was (log, "Focal
 length")."""
-_POSE_SMOOTHING = 0.3  # ridge regularisation of the affine map from poses to pose steps, in keyframes
 _FOCAL_STEP = 0.2  # largest change of the logarithm of a focal length in one step
 
 
-@dataclass(frozen=True, eq=False)
-class SharedPrior:
-    """Prior of the shared parameters for the fit to pixels."""
-
-    lenses: Sequence[int | None]
-    """The lens of each sequence; None if the focal length is known."""
-    focal: Float[Tensor, " q"]
-    """The focal length of each sequence from the fit to landmarks, in pixels."""
-    focal_sigma: float
-    """Standard deviation of the logarithm of a focal length."""
-    identity_weight: float
-
-    @property
-    def groups(self) -> int:
-        """The number of unknown focal lengths."""
-        return 1 + max((lens for lens in self.lenses if lens is not None), default=-1)
-
-
 def step_shared(
-    terms: Sequence[PhotometricTerm], outlines: Sequence[OutlineTerm], fit: Fit, prior: SharedPrior, keyframes: int
+    problem: Problem,
+    terms: Sequence[PhotometricTerm],
+    outlines: Sequence[OutlineTerm],
+    fit: Fit,
+    focals: Float[Tensor, " q"],
+    keyframes: int,
 ) -> Fit:
     """Take one Gauss-Newton step of identity and focal lengths, with the keyframes' own parameters eliminated.
 
     A texture that was estimated with these very poses hardly resists a change that shifts all views alike, but it
     resists a change that the views contradict. So the step gains depth, from parallax. Outlines show the perspective.
+    `focals` are the focal lengths from the fit to landmarks, near which a prior keeps them.
     """
-    subject, bounds = fit.subject, terms[0].layout.bounds
-    rows = [choose_keyframes(own.state[:, :6], keyframes) for own in fit.sequences]
+    subject, bounds, size = fit.subject, terms[0].layout.bounds, len(fit.subject.shared)
+    rows = [choose_keyframes(sequence.state[:, :6], keyframes) for sequence in fit.sequences]
+    precision, values = _prior(problem, fit, focals)
     frames, shared = [], []
-    for term, outline, own, chosen, lens in zip(terms, outlines, fit.sequences, rows, prior.lenses, strict=True):
-        own_frames, own_shared = term.joint_equations(own.state, chosen, fit.subject, own.cameras)
+    for term, outline, own, chosen, lens in zip(terms, outlines, fit.sequences, rows, problem.lenses, strict=True):
+        own_frames, own_shared = term.joint_equations(own.state, chosen, subject, own.cameras)
         if outline.weight > 0:
-            more_frames, more_shared = outline.joint_equations(own.state, chosen, fit.subject, own.cameras)
+            more_frames, more_shared = outline.joint_equations(own.state, chosen, subject, own.cameras)
             own_frames, own_shared = own_frames.plus(more_frames), own_shared.plus(more_shared)
         frames.append(own_frames)
-        shared.append(place_shared(own_shared, lens, prior.groups))
-    precision, values = _prior(fit, prior)
+        shared.append(place_shared(own_shared, lens, len(precision) - size))
     equations = join_frames(frames)
     state = torch.cat([own.state[chosen] for own, chosen in zip(fit.sequences, rows, strict=True)])
     held = bounds.held(state, equations.gradient)
     held[:, 6:] = True  # An expression that all frames share belongs to identity, but would drift here.
     with_prior = join_shared(shared).with_prior(precision, values)
     step, shared_step = solve_arrow(equations, with_prior, held, _SHARED_DAMPING)
-    sequences = []
-    steps = step.split([len(chosen) for chosen in rows])
-    for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, prior.lenses, strict=True):
-        longer = 0.0 if lens is None else float(shared_step[len(subject.shared) + lens])
+    sequences, steps = [], step.split([len(chosen) for chosen in rows])
+    for own, own_step, chosen, lens in zip(fit.sequences, steps, rows, problem.lenses, strict=True):
+        longer = 0.0 if lens is None else float(shared_step[size + lens])
         factor = math.exp(min(max(longer, -_FOCAL_STEP), _FOCAL_STEP))
         sequences.append(SequenceFit(own.cameras.with_focal(factor), move_like_keyframes(own.state, chosen, own_step)))
-    response = terms[0].landmarks.model.response
-    return Fit(move_subject(subject, shared_step[: len(subject.shared)], response), tuple(sequences))
+    return Fit(move_subject(subject, shared_step[:size], problem.model.response), tuple(sequences))
 
 
 def move_like_keyframes(
@@ -86,20 +71,20 @@ def move_like_keyframes(
     middle, scale = pose[chosen].mean(0), pose[chosen].std(0, correction=0).clamp_min(1e-3)
     features = torch.cat([torch.ones_like(pose[:, :1]), (pose - middle) / scale], dim=1)
     keys = features[chosen]
-    ridge = _POSE_SMOOTHING * torch.eye(7).to(pose)
+    ridge = 0.3 * torch.eye(7).to(pose)  # ridge regularisation of the affine map from poses to pose steps, in keyframes
     ridge[0, 0] = 0
     slopes = torch.linalg.solve(keys.T @ keys + ridge, keys.T @ step[:, :6])
     return torch.cat([pose + features @ slopes, state[:, 6:]], dim=1)
 
 
-def _prior(fit: Fit, prior: SharedPrior) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
+def _prior(problem: Problem, fit: Fit, focals: Float[Tensor, " q"]) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"]]:
     """Precisions of the shared parameters, and their present offsets from the prior's means."""
-    identity = fit.subject.identity
-    weights, values = identity.new_zeros(prior.groups), identity.new_zeros(prior.groups)
-    for own, lens, first in zip(fit.sequences, prior.lenses, prior.focal, strict=True):
+    shared, lenses = fit.subject.shared, [lens for lens in problem.lenses if lens is not None]
+    weights, values = (shared.new_zeros(max(lenses, default=-1) + 1) for _ in range(2))
+    for sequence, lens, first in zip(fit.sequences, problem.lenses, focals, strict=True):
         if lens is not None:
-            weights[lens] = prior.focal_sigma**-2
-            values[lens] = (own.cameras.K[0, 0, 0] / first).log()
-    precision = torch.ones_like(fit.subject.shared)
-    precision[: len(identity)] = prior.identity_weight
-    return torch.cat([precision, weights]), torch.cat([fit.subject.shared, values])
+            weights[lens] = problem.settings.photometric.focal_sigma**-2
+            values[lens] = (sequence.cameras.K[0, 0, 0] / first).log()
+    precision = torch.ones_like(shared)
+    precision[: len(fit.subject.identity)] = problem.settings.identity_weight
+    return torch.cat([precision, weights]), torch.cat([shared, values])

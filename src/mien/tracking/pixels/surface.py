@@ -4,15 +4,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.machine.parallel import map_in_threads
 from mien.render.mesh import vertex_normals
 from mien.rotation import left_jacobian, matrix_from_axis_angle
-from mien.tracking.fitting.parameters import ParameterLayout
-from mien.tracking.fitting.views import CameraBatch
+from mien.tracking.fitting.fit import Subject
+from mien.tracking.fitting.parameters import ParameterLayout, joint_derivatives
+from mien.tracking.fitting.solver import NormalEquations, join_frames
+from mien.tracking.fitting.views import CameraBatch, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +45,13 @@ class SurfaceModel:
         self,
         state: Float[Tensor, " p"],
         identity: Float[Tensor, " i"],
-        offsets: Float[Tensor, "v 3"] | None = None,
         *,
         derive: bool = True,
         derive_identity: bool = False,
     ) -> PosedSurface:
         """Vertices, normals and derivatives of one timestep. `state` and `identity` are float64."""
         exact = self.layout.face_params(state[None], identity)
-        exact = replace(exact, vertex_offsets=None if offsets is None else offsets.double())
-        face = replace(exact.to(self.face_model.template), vertex_offsets=offsets)
+        face = exact.to(self.face_model.template)
         shaped = self._shaped(face)
         transforms = self.exact.joint_transforms(exact)[0, :, :3].float()
         blended = (self.face_model.skinning_weights @ transforms.flatten(1)).reshape(-1, 3, 4)
@@ -67,11 +68,15 @@ class SurfaceModel:
         by_rotation = torch.linalg.cross(spin.T[None].expand(len(turned), 3, 3), turned[:, None].expand(-1, 3, 3))
         by_translation = torch.eye(3).expand(len(turned), 3, 3)
         by_expression = self.expression_basis
-        by_joints, by_derived = self._by_joint_motion(exact, shaped)
-        parts = [_apply(rotation @ turns, by_expression), _rotate(rotation, by_joints)]
-        parts[0][:, :, self.layout.derived_column] += _rotate(rotation, by_derived)
-        if self.exact.pose_basis is not None and by_joints.shape[-1]:
-            parts[1] = parts[1] + _apply(rotation @ turns, self._pose_correctives(exact))
+        by_transforms, by_turns = joint_derivatives(self.layout, self.exact, exact)
+        angles, motion = len(self.layout.joint_index), self._skinned(by_transforms[:, 0].float(), shaped)
+        parts = [_apply(rotation @ turns, by_expression), _rotate(rotation, motion[..., :angles])]
+        parts[0][:, :, self.layout.derived_column] += _rotate(rotation, motion[..., angles:])
+        basis = self.face_model.pose_basis
+        if basis is not None and angles:
+            correctives = by_turns[:angles, 0].float() @ basis.flatten(1)
+            correctives = correctives.reshape(-1, *basis.shape[1:]).permute(1, 2, 0)
+            parts[1] = parts[1] + _apply(rotation @ turns, correctives)
         if derive_identity:
             parts.append(_apply(rotation @ turns, self.identity_basis))
         return PosedSurface(vertices, normals, torch.cat([by_rotation.mT, by_translation, *parts], dim=-1).contiguous())
@@ -80,34 +85,10 @@ class SurfaceModel:
         model = self.face_model
         shaped = model.template + self.identity_basis @ face.identity
         shaped = shaped + self.expression_basis @ face.expression[0, self.layout.expression_index]
-        if face.vertex_offsets is not None:
-            shaped = shaped + face.vertex_offsets
         if model.pose_basis is not None:
             turned = matrix_from_axis_angle(face.joints) - torch.eye(3)
             shaped = shaped + (turned.flatten() @ model.pose_basis.flatten(1)).reshape(-1, 3)
         return shaped
-
-    def _by_joint_motion(
-        self, face: FaceParams, shaped: Float[Tensor, "v 3"]
-    ) -> tuple[Float[Tensor, "v 3 m"], Float[Tensor, "v 3 d"]]:
-        """Derivatives in the head frame by free joint angles, and by expressions that move a joint."""
-        free, derived = self.layout.joint_index, self.layout.derived_expression
-        angles = face.joints.flatten(1)
-        at = torch.cat([angles[0, free], face.expression[0, derived]])
-        if len(at) == 0:
-            return shaped.new_zeros(len(shaped), 3, 0), shaped.new_zeros(len(shaped), 3, 0)
-
-        def transforms(parameters: Float[Tensor, "n q"]) -> Tensor:
-            n = len(parameters)
-            moved = angles.expand(n, -1).index_copy(1, free, parameters[:, : len(free)])
-            expression = face.expression.expand(n, -1).index_copy(1, derived, parameters[:, len(free) :])
-            head = face.head_rotation.expand(n, -1), face.head_translation.expand(n, -1)
-            joints = moved.reshape(n, *face.joints.shape[1:])
-            moved_face = FaceParams(face.identity, expression, joints, *head, face.vertex_offsets)
-            return self.exact.joint_transforms(moved_face)[:, :, :3]
-
-        motion = self._skinned(_derivatives(transforms, at).float(), shaped)
-        return motion[..., : len(free)], motion[..., len(free) :]
 
     def _skinned(self, by_transforms: Float[Tensor, "n k 3 4"], shaped: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 n"]:
         n, k = by_transforms.shape[:2]
@@ -115,23 +96,9 @@ class SurfaceModel:
         weighted = (self.face_model.skinning_weights[:, :, None] * points[:, None]).flatten(1)
         return (weighted @ by_transforms.permute(1, 3, 2, 0).reshape(k * 4, 3 * n)).reshape(-1, 3, n)
 
-    def _pose_correctives(self, face: FaceParams) -> Float[Tensor, "v 3 m"]:
-        """Derivatives of the pose correctives, at rest, by the free joint angles."""
-        assert self.face_model.pose_basis is not None
-        angles = face.joints.flatten(1)
-        free = self.layout.joint_index
-
-        def turns(parameters: Float[Tensor, "n m"]) -> Tensor:
-            moved = angles.expand(len(parameters), -1).index_copy(1, free, parameters)
-            return matrix_from_axis_angle(moved.reshape(len(parameters), *face.joints.shape[1:])).flatten(1)
-
-        by_angle = _derivatives(turns, angles[0, free]).float()
-        basis = self.face_model.pose_basis
-        return (by_angle @ basis.flatten(1)).reshape(-1, *basis.shape[1:]).permute(1, 2, 0)
-
 
 def surface_model(face_model: FaceModel, layout: ParameterLayout) -> SurfaceModel:
-    """Make the surface model of a face model and a layout."""
+    """The surface model of a face model and a layout."""
     model = face_model.to(torch.zeros(()))
     return SurfaceModel(
         model,
@@ -153,13 +120,40 @@ def _rotate(rotation: Float[Tensor, "3 3"], vectors: Float[Tensor, "v 3 n"]) -> 
     return torch.einsum("rc,vcn->vrn", rotation, vectors)
 
 
-def _derivatives(function: Callable[[Tensor], Tensor], at: Float[Tensor, " q"]) -> Float[Tensor, "q ..."]:
-    """Derivatives of a function by each parameter, by central differences. It takes a batch of parameter vectors."""
-    step = 1e-5 * torch.eye(len(at)).to(at)
-    return (function(at + step) - function(at - step)) / 2e-5
+def equations_of_pictures(
+    model: SurfaceModel,
+    views: Views,
+    state: Float[Tensor, "v p"],
+    rows: Int[Tensor, " k"],
+    subject: Subject,
+    cameras: CameraBatch,
+    weight: float,
+    of_picture: Callable[[PosedSurface, int, int, CameraBatch], tuple[float, Tensor, Tensor]],
+    shared: bool,
+) -> NormalEquations:
+    """The normal equations of some timesteps: the weighted sum of those of their pictures.
+
+    `of_picture` returns cost, half gradient and half Hessian of a posed surface, a timestep's row and a camera. If they
+    are `shared`, the parameters of each timestep are followed by identity and the logarithm of the focal length.
+    """
+
+    def of_row(row: int) -> NormalEquations:
+        posed, seen_by = model.pose(state[row], subject.identity, derive_identity=shared), views.seen_by(row)
+        assert posed.jacobian is not None
+        if shared:
+            by_focal = _by_log_focal(posed.vertices, cameras, seen_by)
+            posed = replace(posed, jacobian=torch.cat([posed.jacobian, by_focal], dim=2).contiguous())
+        costs, gradients, hessians = zip(*(of_picture(posed, row, camera, cameras) for camera in seen_by), strict=True)
+        return NormalEquations(
+            weight * torch.tensor([sum(costs)], dtype=torch.float64),
+            weight * torch.stack(gradients).sum(0, keepdim=True),
+            weight * torch.stack(hessians).sum(0, keepdim=True),
+        )
+
+    return join_frames(map_in_threads(of_row, rows.tolist()))
 
 
-def by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
+def _by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
     """Motion of vertices across the line of sight that looks like a change of the focal length, per log focal length.
 
     It is zero if several cameras see the timestep.

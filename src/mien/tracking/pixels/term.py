@@ -1,6 +1,6 @@
 """The cost of the pixels and landmarks of one sequence, with its normal equations."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -10,13 +10,13 @@ from mien import _native
 from mien.machine.parallel import map_in_threads
 from mien.tracking.fitting.fit import Subject
 from mien.tracking.fitting.parameters import ParameterLayout
-from mien.tracking.fitting.solver import NormalEquations, SharedEquations, join_frames
+from mien.tracking.fitting.solver import NormalEquations, SharedEquations
 from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.term import LandmarkTerm
-from mien.tracking.pixels.comparison import LEAST_PIXELS
+from mien.tracking.pixels.outcome import LEAST_PIXELS
 from mien.tracking.pixels.pictures import Pictures
-from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, by_log_focal
-from mien.tracking.pixels.texture import Sighting
+from mien.tracking.pixels.surface import PosedSurface, SurfaceModel, equations_of_pictures
+from mien.tracking.pixels.texture import SurfaceView
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,7 @@ class PhotometricTerm:
         """The normal equations of some timesteps, each on its own, with the shared parameters fixed."""
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=False)
         marks = self.landmarks.at(rows).equations(state[rows], subject, cameras)
-        return NormalEquations(
-            marks.cost + pixels.cost, marks.gradient + pixels.gradient, marks.hessian + pixels.hessian
-        )
+        return marks.plus(pixels)
 
     def costs(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
         """The cost of each timestep."""
@@ -68,19 +66,19 @@ class PhotometricTerm:
 
     def residuals(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, "v c"]:
         """Robust root mean square of the colour differences; NaN where too few pixels of a camera were compared."""
-        found = torch.full((len(state), len(cameras)), torch.nan)
+        residuals = torch.full((len(state), len(cameras)), torch.nan)
 
         def of_row(row: int) -> None:
             posed = self.model.pose(state[row], subject.identity, derive=False)
             for camera in self.landmarks.views.seen_by(row):
                 picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
-                seen = Sighting(posed, picture, self.light).arrays()
+                seen = SurfaceView(posed, picture, self.light).arrays()
                 cost, weight = _native.align_mesh(self.surface, seen, self.light_radius, None, None, None)
                 if weight >= LEAST_PIXELS:
-                    found[row, camera] = self.sigma * cost**0.5
+                    residuals[row, camera] = self.sigma * cost**0.5
 
         map_in_threads(of_row, list(range(len(state))))
-        return found
+        return residuals
 
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
@@ -97,21 +95,10 @@ class PhotometricTerm:
     def _pixel_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch, shared: bool
     ) -> NormalEquations:
-        def of_row(row: int) -> NormalEquations:
-            posed = self.model.pose(state[row], subject.identity, derive_identity=shared)
-            seen_by = self.landmarks.views.seen_by(row)
-            assert posed.jacobian is not None
-            if shared:
-                by_focal = by_log_focal(posed.vertices, cameras, seen_by)
-                posed = replace(posed, jacobian=torch.cat([posed.jacobian, by_focal], dim=2).contiguous())
-            parts = [self._align(posed, row, camera, cameras) for camera in seen_by]
-            return NormalEquations(
-                self.weight * torch.tensor([sum(cost for cost, _, _ in parts)], dtype=torch.float64),
-                self.weight * torch.stack([gradient for _, gradient, _ in parts]).sum(0, keepdim=True),
-                self.weight * torch.stack([hessian for _, _, hessian in parts]).sum(0, keepdim=True),
-            )
-
-        return join_frames(map_in_threads(of_row, rows.tolist()))
+        views = self.landmarks.views
+        return equations_of_pictures(
+            self.model, views, state, rows, subject, cameras, self.weight, self._align, shared=shared
+        )
 
     def _align(
         self, posed: PosedSurface, row: int, camera: int, cameras: CameraBatch
@@ -122,6 +109,6 @@ class PhotometricTerm:
         jacobian = posed.jacobian
         derivatives = None if jacobian is None else _native.AlignDerivatives(jacobian, hessian, gradient)
         picture = self.pictures.picture(int(self.timesteps[row]), camera, cameras)
-        seen = Sighting(posed, picture, self.light).arrays()
+        seen = SurfaceView(posed, picture, self.light).arrays()
         cost, _ = _native.align_mesh(self.surface, seen, self.light_radius, derivatives, None, None)
         return cost, gradient.double(), hessian.double()

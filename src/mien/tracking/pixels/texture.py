@@ -15,15 +15,16 @@ from mien import _native
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.render.mesh import MeshFragments, rasterize_mesh
-from mien.tracking.eyelids.crops import LEAST_COSINE
 from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
 from mien.tracking.pixels.surface import PosedSurface
 
-_LEAST_WEIGHT = 0.05  # least total weight of a texel's sightings (each the squared cosine) for the texel to be known
+LIGHT_EXTENT = 0.012
+"""Extent on the face, in metres, over which a smooth difference counts as light that the model does not explain."""
+LEAST_COSINE = 0.25
+"""Least cosine between the surface's normal and the direction to the camera at which the surface's colour is used."""
 _FIRST_SIGMA = 0.1  # expected colour difference (0..1) before anything is known
 _SIGMA_BOUNDS = (0.01, 0.1)  # bounds of the expected colour difference afterwards
-_LIGHT_ROUNDS = 3  # number of rounds of albedo and light in turn
 _LIGHT_STIFFNESS = 0.02
 """Weight of the prior that pulls the light towards an even one, relative to the evidence of the pictures."""
 
@@ -40,7 +41,7 @@ class SkinTexture:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class SurfaceView:
     """A posed surface in a picture under a light."""
 
     posed: PosedSurface
@@ -49,12 +50,8 @@ class Sighting:
     share: float = 1.0
     """Weight of the picture in the texture."""
 
-    def weighted(self) -> "Sighting":
-        """The sighting with its share multiplied into the mask."""
-        return replace(self, picture=replace(self.picture, mask=self.picture.mask * self.share))
-
     def arrays(self) -> "_native.SightingArrays":
-        """The sighting in the form in which the native core takes it."""
+        """The view in the form in which the native core takes it."""
         camera, picture = self.picture.camera, self.picture
         return _native.SightingArrays(
             self.posed.vertices, self.posed.normals, camera.K, camera.viewmat, picture.image, picture.mask, self.light
@@ -97,100 +94,76 @@ def even_light() -> Float[Tensor, "9 3"]:
     return light
 
 
-def unknown_texture(space: TextureSpace) -> SkinTexture:
-    """The appearance before any picture: no texel is known."""
-    size = space.fragments.face_index.shape
-    return SkinTexture(torch.zeros(*size, 3), torch.zeros(size), _FIRST_SIGMA)
+def unknown_texture(size: int) -> SkinTexture:
+    """The texture before any picture: none of the size x size texels is known."""
+    return SkinTexture(torch.zeros(size, size, 3), torch.zeros(size, size), _FIRST_SIGMA)
 
 
 def estimate_appearance(
-    space: TextureSpace, sightings: Sequence[Sequence[Sighting]], start: SkinTexture, outlier: float, light_radius: int
+    space: TextureSpace, views: Sequence[Sequence[SurfaceView]], start: SkinTexture, outlier: float, light_radius: int
 ) -> tuple[SkinTexture, list[Float[Tensor, "9 3"]]]:
     """Estimate the albedo in turn with the light of every sequence.
 
     The albedo is a least squares fit for each texel, which is robust from the second round on.
 
-    Args:
-        space: The texels.
-        sightings: Sightings of each sequence, with the light known so far.
-        start: The appearance known so far. Its sigma scales the robust weights.
-        outlier: Outlier threshold in sigmas.
-        light_radius: Radius in pixels over which a smooth difference counts as light and is left out of the texture.
+    The views of each sequence have its light known so far, and `start` has the texture; its sigma scales the robust
+    weights, which fade beyond `outlier` sigmas. What is smooth over `light_radius` pixels counts as light and is left
+    out of the texture.
     """
     texture, known = start, bool((start.trust > 0).any())
-    lights = [own[0].light for own in sightings]
-    for turn in range(_LIGHT_ROUNDS):
-        texture = _bake(space, sightings, lights, texture, outlier)
+    for turn in range(3):  # number of rounds of albedo and light in turn
+        texture = _bake(space, views, texture, outlier)
         if not texture.trust.any():
-            return texture, lights
+            return texture, [own[0].light for own in views]
         if turn == 0 and not known:
-            texture = _one_color(texture)
-        lights = [_fit_light(space, own, light, texture, outlier) for own, light in zip(sightings, lights, strict=True)]
-    even = [
-        [_without_smooth_residual(space, replace(one, light=light), texture, outlier, light_radius) for one in own]
-        for own, light in zip(sightings, lights, strict=True)
-    ]
-    return _bake(space, even, lights, texture, outlier), lights
+            # The median colour in all known texels: at the start, all variation counts as light.
+            median, seen = texture.albedo[texture.trust > 0].median(0).values, texture.trust > 0
+            texture = replace(texture, albedo=seen[..., None] * median, sigma=_FIRST_SIGMA)
+        surface = space.native(texture, outlier)
+        views = [_relit(surface, own) for own in views]
+    even = [[_without_smooth_residual(surface, view, light_radius) for view in own] for own in views]
+    return _bake(space, even, texture, outlier), [own[0].light for own in views]
 
 
-def _without_smooth_residual(
-    space: TextureSpace, sighting: Sighting, texture: SkinTexture, outlier: float, radius: int
-) -> Sighting:
-    """The sighting without the part of its difference from the prediction that is smooth over `radius` pixels."""
-    smooth = torch.empty_like(sighting.picture.image)
-    surface = space.native(texture, outlier)
-    _native.align_mesh(surface, sighting.arrays(), radius, None, None, smooth)
-    return replace(sighting, picture=replace(sighting.picture, image=sighting.picture.image - smooth))
+def _without_smooth_residual(surface: "_native.AlignSurface", view: SurfaceView, radius: int) -> SurfaceView:
+    """The view without the part of its difference from the prediction that is smooth over `radius` pixels."""
+    smooth = torch.empty_like(view.picture.image)
+    _native.align_mesh(surface, view.arrays(), radius, None, None, smooth)
+    return replace(view, picture=replace(view.picture, image=view.picture.image - smooth))
 
 
 def _bake(
-    space: TextureSpace,
-    sightings: Sequence[Sequence[Sighting]],
-    lights: Sequence[Float[Tensor, "9 3"]],
-    texture: SkinTexture,
-    outlier: float,
+    space: TextureSpace, views: Sequence[Sequence[SurfaceView]], texture: SkinTexture, outlier: float
 ) -> SkinTexture:
-    size = space.fragments.face_index.shape
-    surface = space.native(texture, outlier)
+    """The albedo that explains all views under their lights."""
+    size, surface = space.fragments.face_index.shape, space.native(texture, outlier)
     weight = torch.zeros(size)
     squares, mixed, image = (torch.zeros(*size, 3) for _ in range(3))
     sums = _native.TextureSums(weight, squares, mixed, image)
-    for own, light in zip(sightings, lights, strict=True):
-        for sighting in own:
-            seen = replace(sighting, light=light).weighted().arrays()
-            _native.bake_texture(surface, seen, space.fragments.face_index, space.fragments.barycentric, sums)
-    known = weight > _LEAST_WEIGHT
+    for view in (view for own in views for view in own):
+        picture = replace(view.picture, mask=view.picture.mask * view.share)
+        seen = replace(view, picture=picture).arrays()
+        _native.bake_texture(surface, seen, space.fragments.face_index, space.fragments.barycentric, sums)
+    known = weight > 0.05  # least total weight of a texel's views (each the squared cosine) for the texel to be known
     albedo = mixed / squares.clamp_min(1e-6) * known[..., None]
     variance = ((image - albedo * mixed).sum(-1) / weight.clamp_min(1e-6)).clamp_min(0)
-    bounds = _SIGMA_BOUNDS
-    sigma = float(variance[known].median().sqrt().clamp(*bounds)) if known.any() else texture.sigma
+    sigma = float(variance[known].median().sqrt().clamp(*_SIGMA_BOUNDS)) if known.any() else texture.sigma
     trust = known * (sigma**2 / (0.5 * sigma**2 + variance)).clamp_max(1.0)
     return SkinTexture(albedo, trust, sigma)
 
 
-def _one_color(texture: SkinTexture) -> SkinTexture:
-    """The texture with its median colour in all known texels. At the start, all variation counts as light."""
-    median = texture.albedo[texture.trust > 0].median(0).values
-    return replace(texture, albedo=(texture.trust > 0)[..., None] * median, sigma=_FIRST_SIGMA)
-
-
-def _fit_light(
-    space: TextureSpace,
-    sightings: Sequence[Sighting],
-    light: Float[Tensor, "9 3"],
-    texture: SkinTexture,
-    outlier: float,
-) -> Float[Tensor, "9 3"]:
+def _relit(surface: "_native.AlignSurface", views: Sequence[SurfaceView]) -> list[SurfaceView]:
+    """The views of a sequence with the light that explains them."""
     hessian, right = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
-    surface = space.native(texture, outlier)
-    for sighting in sightings:
-        _native.light_equations(surface, replace(sighting, light=light).arrays(), hessian, right)
+    for view in views:
+        _native.light_equations(surface, view.arrays(), hessian, right)
     hessian = hessian + hessian.triu(1).mT
     most = hessian.diagonal(dim1=1, dim2=2).amax(1)
     stiffness = _LIGHT_STIFFNESS * most[:, None].expand(3, 9).clone() + 1e-9
     hessian = hessian + torch.diag_embed(stiffness)
     right = right + stiffness * even_light().T.double()
-    return torch.linalg.solve(hessian, right).T.float().contiguous()
+    light = torch.linalg.solve(hessian, right).T.float().contiguous()
+    return [replace(view, light=light) for view in views]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,45 +12,27 @@ from jaxtyping import Float, UInt8
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
 from mien.media.picture_files import write_png
-from mien.tracking.report.heat import draw_legend, write_text
-from mien.tracking.report.overlay import OverlayPainter, frontal_camera
+from mien.tracking.report.overlay import OverlayPainter, frontal_camera, write_text
 from mien.tracking.tracking import Tracking
 
-_EVEN, _MAX_FLAGGED, _MAX_ALONE = 8, 8, 4
-"""Largest numbers of evenly spread frames, of flagged frames, and of frames tracked from landmarks alone."""
-_FEW = 6
-"""Largest number of pictures of an overlay sheet."""
-_TILE = 240
-"""Side of each tile, in pixels."""
+_EVEN, _MAX_FLAGGED, _MAX_ALONE = 8, 8, 4  # of evenly spread and flagged frames, and of those from landmarks alone
+_TILE = 240  # side of each tile, in pixels
 
 
 @dataclass(frozen=True)
 class SheetFrame:
-    """One frame on a contact sheet."""
+    """One frame on a contact sheet, and why it stands out; empty for an evenly spread frame."""
 
     timestep: int
     camera: int
     why: str = ""
-    """Why the frame stands out; empty for an evenly spread frame."""
-
-
-@dataclass(frozen=True, eq=False)
-class SheetRow:
-    """A frame of the contact sheet with its panels, which are square and of one size."""
-
-    name: str
-    odd: bool
-    """Whether the frame stands out."""
-    tiles: Sequence[UInt8[np.ndarray, "h w 3"]]
 
 
 def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int]) -> list[SheetFrame]:
     """The frames to show, in the order of time: evenly spread ones from the frontal camera, and ones that stand out.
 
-    Args:
-        tracking: The tracking. At least one of its frames has a face.
-        flagged: Timesteps that stand out. Those with the largest residuals are shown, each from its worst camera.
-        alone: Timesteps tracked from landmarks alone. If they are half of those with a face or more, none is shown.
+    Of `flagged` timesteps, those with the largest residuals are shown, each from its worst camera. Of those tracked
+    from landmarks `alone`, none is shown if they are half of those with a face or more.
     """
     frontal, valid = frontal_camera(tracking), tracking.valid.nonzero()[:, 0]
     even = valid[torch.linspace(0, len(valid) - 1, min(_EVEN, len(valid))).round().long()].tolist()
@@ -73,14 +55,6 @@ def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> 
     return sorted(worst, key=lambda one: -known[one])
 
 
-def sheet_rows(
-    capture: Capture, tracking: Tracking, face_model: FaceModel, frames: Sequence[SheetFrame]
-) -> list[SheetRow]:
-    """The pictures of each frame: all panels, cut to the head."""
-    painter = OverlayPainter(capture, tracking, face_model)
-    return [SheetRow(_name(capture, frame), bool(frame.why), _tiles(painter, capture, frame)) for frame in frames]
-
-
 def write_overlay_sheet(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
     """Write at most six pictures in a row, cut to the head, with the mesh over the same pictures below them.
 
@@ -89,31 +63,24 @@ def write_overlay_sheet(path: Path, capture: Capture, tracking: Tracking, face_m
     """
     painter, cameras = OverlayPainter(capture, tracking, face_model), len(tracking.cameras)
     valid, frontal = tracking.valid.nonzero()[:, 0], frontal_camera(tracking)
-    count = min(_FEW, max(len(valid), cameras))
+    count = min(6, max(len(valid), cameras))
     columns = []
     for index, place in enumerate(torch.linspace(0, len(valid) - 1, count).round().long()):
         frame = SheetFrame(int(valid[place]), (frontal + index * cameras // count) % cameras)
-        tiles = _tiles(painter, capture, frame)[:2]
-        write_text(tiles[0], _name(capture, frame), (6, 16), 0.45)
+        tiles = tiles_of(painter, capture, frame)[:2]
+        write_text(tiles[0], name_of(capture, frame), (6, 16), 0.45)
         columns.append(np.concatenate(tiles, axis=0))
     write_png(path, np.concatenate(columns, axis=1))
 
 
-def _name(capture: Capture, frame: SheetFrame) -> str:
+def name_of(capture: Capture, frame: SheetFrame) -> str:
+    """The caption of a frame."""
     camera = "" if len(capture.camera_ids) == 1 else f", camera {capture.camera_ids[frame.camera]}"
     return f"Frame {frame.timestep}{camera}{', ' * bool(frame.why)}{frame.why}"
 
 
-def strip(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """A frame's picture and the mesh over it. If pixels were compared, also the model's picture and the heat map."""
-    tiles = _tiles(painter, capture, frame)
-    write_text(tiles[0], name, (6, 16), 0.45)
-    if len(tiles) > 2:
-        draw_legend(tiles[-1], 8)
-    return np.concatenate(tiles, axis=1)
-
-
-def _tiles(painter: OverlayPainter, capture: Capture, frame: SheetFrame) -> list[UInt8[np.ndarray, "h w 3"]]:
+def tiles_of(painter: OverlayPainter, capture: Capture, frame: SheetFrame) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """The panels of a frame cut to the head, square and of one size, but with the plain picture as the first."""
     image = np.asarray(capture.images[frame.timestep, frame.camera])
     rows, columns = painter.head_box(frame.timestep, frame.camera)
     panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]

@@ -1,4 +1,4 @@
-"""The overlay video, which shows whether the tracked mesh fits the pictures."""
+"""The overlay video, which shows whether the tracked mesh fits the pictures, and heat maps of colour differences."""
 
 import math
 from collections.abc import Iterator
@@ -15,11 +15,12 @@ from mien.face.model import FaceModel
 from mien.face.params import most_frontal_camera
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
+from mien.media.pictures import heat_colors
 from mien.media.video import write_video
 from mien.render.mesh import Headlight, render_mesh
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
-from mien.tracking.pixels.comparison import model_pictures, window_of
-from mien.tracking.report.heat import dimmed, draw_legend, heat_map, write_text
+from mien.tracking.pixels.outcome import model_pictures
+from mien.tracking.pixels.pictures import window_of
 from mien.tracking.report.rig import seen_from_front, visible_landmarks
 from mien.tracking.tracking import Tracking
 
@@ -28,16 +29,11 @@ _REGION_COLORS = {
     "teeth": (1.0, 1.0, 0.85), "mouth": (0.45, 0.1, 0.1), "brows": (0.6, 0.55, 0.4), "ears": (0.65, 0.9, 0.6),
     "nose": (0.9, 0.85, 0.6), "tongue": (0.85, 0.55, 0.5),
 }  # fmt: skip
-_SKIN = (0.8, 0.78, 0.75)
 _MESH_OPACITY = 0.6
+_DIMMED = 0.35  # brightness of pixels that are not compared
+HOTTEST = 0.15
+"""Length of the colour difference (each channel 0..1) that is drawn brightest."""
 _GREEN, _RED, _BLUE = (60, 255, 60), (255, 60, 40), (60, 160, 255)
-_SUBPIXEL_BITS = 4
-_GRID_WIDTH = 1920
-"""Largest width of a grid of pictures, in pixels."""
-_MAX_PICTURES = 120
-"""Number of pictures that take about five seconds on two cores."""
-_CRF, _PRESET = 21, "veryfast"
-"""Quality that is enough for viewing. Writing takes a quarter of the time of `write_video`'s defaults."""
 
 
 def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, every: int = 1) -> None:
@@ -46,12 +42,13 @@ def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: 
     If `every` is n, it shows every n-th timestep at 1/n of the frame rate, so it lasts as long as the capture. Several
     cameras form a grid, in the order of the capture, which is scaled down to at most 1920 pixels across.
     """
-    write_video(path, _pictures(capture, tracking, face_model, every), capture.fps / every, _CRF, _PRESET)
+    # Quality that is enough for viewing takes a quarter of the time of `write_video`'s defaults.
+    write_video(path, _pictures(capture, tracking, face_model, every), capture.fps / every, 21, "veryfast")
 
 
 def overlay_stride(timesteps: int) -> int:
     """Stride between the timesteps that an overlay shows, at least 1, so that there are at most 120 pictures."""
-    return max(1, math.ceil(timesteps / _MAX_PICTURES))
+    return max(1, math.ceil(timesteps / 120))  # number of pictures that take about five seconds on two cores
 
 
 class OverlayPainter:
@@ -119,7 +116,8 @@ class OverlayPainter:
             draw_points(picture, detected, _GREEN)
         draw_points(picture, marks, _RED)
         cut = fit_neck_cut(self._neck, vertices, tracking.face.T_world_head[timestep, :3, 1])
-        _draw_edge(picture, above_neck_cut(cut, camera))
+        kept = (above_neck_cut(cut, camera) > 0.5).astype(np.uint8)
+        picture[cv2.morphologyEx(kept, cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0] = _BLUE
         return picture
 
     def caption(self, timestep: int, camera_index: int) -> str:
@@ -152,7 +150,9 @@ class OverlayPainter:
         assert self._models is not None
         compared = self._models.compare(timestep, camera_index, vertices)
         part = compared.window.rows, compared.window.columns
-        difference, behind = compared.difference.numpy(), dimmed(image)
+        difference = compared.difference.numpy()
+        gray = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+        behind = cv2.cvtColor(cv2.convertScaleAbs(gray, alpha=_DIMMED), cv2.COLOR_GRAY2RGB)
         known = np.isfinite(difference)[..., None]
         own = (255 * compared.image.nan_to_num(0).clamp_(0, 1)).to(torch.uint8).numpy()
         panels = [behind, behind.copy()]
@@ -168,7 +168,7 @@ def frontal_camera(tracking: Tracking) -> int:
 
 def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
     """Colours of the corners of every triangle, which tell lips, lids, irises, ears and other regions apart."""
-    palette = torch.tensor([_REGION_COLORS.get(name, _SKIN) for name in face_model.region_names])
+    palette = torch.tensor([_REGION_COLORS.get(name, (0.8, 0.78, 0.75)) for name in face_model.region_names])
     return palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
 
 
@@ -179,7 +179,7 @@ def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndar
     tall, wide = pictures[0].shape[:2]
     columns = math.ceil(math.sqrt(cameras * tall / wide))
     rows = math.ceil(cameras / columns)
-    scale = min(1.0, _GRID_WIDTH / (columns * wide))
+    scale = min(1.0, 1920 / (columns * wide))  # largest width of a grid of pictures, in pixels
     # Video codecs need even sizes.
     width, height = (max(2, round(side * scale / 2) * 2) for side in (wide, tall))
     grid = np.zeros((rows * height, columns * width, 3), np.uint8)
@@ -200,16 +200,35 @@ def _pictures(
 
 def draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:
     """Draw landmarks as discs."""
-    for x, y in _fixed_point(points):
-        cv2.circle(image, (int(x), int(y)), 1 << _SUBPIXEL_BITS, color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+    bits = 4  # of OpenCV's fixed-point format, with pixel centres at whole numbers
+    for x, y in np.round(np.clip((points - 0.5) * (1 << bits), -(2**28), 2**28)).astype(np.int32).tolist():
+        cv2.circle(image, (x, y), 1 << bits, color, -1, cv2.LINE_AA, bits)
 
 
-def _draw_edge(image: UInt8[np.ndarray, "h w 3"], keep: Float[np.ndarray, "h w"]) -> None:
-    """Draw the line between what is kept (1) and what is not (0)."""
-    edge = cv2.morphologyEx((keep > 0.5).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8))
-    image[edge > 0] = _BLUE
+def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Differences in the colours of `inferno`. Black is no difference, or an unknown one (NaN)."""
+    return heat_colors(difference, HOTTEST)
 
 
-def _fixed_point(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """Points in OpenCV's fixed-point format, with pixel centres at whole numbers."""
-    return np.round(np.clip((points - 0.5) * (1 << _SUBPIXEL_BITS), -(2**28), 2**28)).astype(np.int32)
+def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:
+    """Draw a colour bar at the left, from no difference to the largest that is shown. Small pictures get none."""
+    height, width = picture.shape[:2]
+    margin, thick, white = 8, 8, (255, 255, 255)
+    length = min(120, width // 2 - 2 * margin)
+    if length < 32 or height < top + 64:
+        return
+    left = 3 * margin
+    bar = np.broadcast_to(np.linspace(0, 255, length), (thick, length))
+    picture[top : top + thick, left : left + length] = heat_colors(bar, 255.0)
+    cv2.rectangle(picture, (left - 1, top - 1), (left + length, top + thick), white, 1)
+    write_text(picture, "0", (margin, top + thick), 0.4)
+    write_text(picture, f"{100 * HOTTEST:.0f} %", (left + length + margin, top + thick), 0.4)
+
+
+def write_text(picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], size: float = 0.5) -> None:
+    """Draw white letters with a black rim. `at` is the left end of their baseline."""
+    left, foot = at
+    # The rim is the same letters shifted, because thicker letters would also be wider.
+    rim = [(left + x, foot + y, (0, 0, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    for x, y, color in (*rim, (left, foot, (255, 255, 255))):
+        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

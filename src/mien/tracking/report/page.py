@@ -4,23 +4,31 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from mien.capture.capture import Capture
-from mien.disk.files import write_atomically
+from mien.disk.files import write_atomically, write_json
 from mien.face.model import FaceModel
 from mien.media.pictures import picture_uri, shrink
 from mien.pages.pages import render
-from mien.tracking.report.contact_sheet import SheetRow, sheet_frames, sheet_rows
-from mien.tracking.report.curves import Curves, charts
-from mien.tracking.report.heat import HOTTEST
-from mien.tracking.report.overlay import OverlayPainter
+from mien.pages.plots import Axes, Series, line_chart
+from mien.tracking.report.contact_sheet import SheetFrame, name_of, sheet_frames, tiles_of
+from mien.tracking.report.overlay import HOTTEST, OverlayPainter, frontal_camera
+from mien.tracking.report.residuals import (
+    depths,
+    iris_distances,
+    landmarks_of,
+    residual_report,
+    seen_rotation,
+    timestep_residuals,
+)
 from mien.tracking.tracking import Tracking
 
 _JPEG_QUALITY = 85
-_POSTER = 960
-"""Longer side of the poster of the video, in pixels."""
+_POSTER = 960  # longer side of the poster of the video, in pixels
 _PANELS = ("Picture", "Tracked mesh", "Model", "Difference")
-_SOME = 40
-"""Largest number of frames, or runs of frames, that a finding names."""
+_SOME = 40  # largest number of frames, or runs of frames, that a finding names
 _FOCAL_FROM = {
     "calibrated": "as calibrated",
     "given": "as given",
@@ -41,23 +49,17 @@ _WAYS = {
 }
 
 
-def write_report_page(
-    folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any], curves: Curves
-) -> None:
-    """Write report.html into `folder`. Except for the overlay video, the page is complete in one file.
+def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
+    """Write residuals.json and report.html into `folder` and return the main findings as text.
 
-    Args:
-        folder: Folder of the tracking.
-        capture: The capture.
-        tracking: The tracking of the capture.
-        face_model: The face model of the tracking.
-        report: The result of `residual_report`.
-        curves: What is drawn over time.
+    Except for the overlay video, the page is complete in one file.
     """
-    frames = sheet_frames(tracking, report["flagged_frames"], report["landmarks_only_frames"])
-    rows = [_shown(row) for row in sheet_rows(capture, tracking, face_model, frames)]
-    middle = next((frame for frame in frames if not frame.why), frames[0])
+    report = residual_report(capture, tracking, face_model)
+    write_json(folder / "residuals.json", "mien.residual_report", 1, report)
     painter = OverlayPainter(capture, tracking, face_model)
+    frames = sheet_frames(tracking, report["flagged_frames"], report["landmarks_only_frames"])
+    rows = [panels_of(painter, capture, frame, name_of(capture, frame)) for frame in frames]
+    middle = next((frame for frame in frames if not frame.why), frames[0])
     poster = picture_uri(shrink(painter.picture(middle.timestep, middle.camera), _POSTER), _JPEG_QUALITY)
     text = render(
         "tracking/report/templates/report.html",
@@ -66,20 +68,55 @@ def write_report_page(
         findings=findings(tracking, report),
         tiles=_tiles(report),
         figures=_figures(report),
-        panels=_PANELS[: len(rows[0]["pictures"])],
         rows=rows,
         hottest=f"{100 * HOTTEST:.0f} %",
-        charts=charts(curves),
+        charts=_charts(capture, tracking, face_model, report),
     )
     write_atomically(folder / "report.html", lambda path: path.write_text(text, encoding="utf-8"))
+    return " ".join(text for _, text in findings(tracking, report))
 
 
-def _shown(row: SheetRow) -> dict[str, Any]:
+def panels_of(painter: OverlayPainter, capture: Capture, frame: SheetFrame, name: str) -> dict[str, Any]:
+    """A frame's panels for the pages, which templates/frames.html shows."""
     pictures = [
-        {"what": f"{row.name}: {panel.lower()}", "source": picture_uri(tile, _JPEG_QUALITY)}
-        for panel, tile in zip(_PANELS, row.tiles, strict=False)
+        {"what": f"{name}: {panel.lower()}", "source": picture_uri(tile, _JPEG_QUALITY)}
+        for panel, tile in zip(_PANELS, tiles_of(painter, capture, frame), strict=False)
     ]
-    return {"name": row.name, "odd": row.odd, "pictures": pictures}
+    panels = ", ".join(_PANELS[: len(pictures)]).lower()
+    return {"name": name, "odd": bool(frame.why), "pictures": pictures, "panels": panels}
+
+
+def _charts(
+    capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """What changes over time. Flagged timesteps are dots; those without a face are shaded."""
+    t, odd, frontal = np.asarray(capture.timestamps, np.float64), report["flagged_frames"], frontal_camera(tracking)
+    detected = torch.from_numpy(np.asarray(capture.landmarks[:, frontal], dtype=np.float32))
+    depth = tracking.cameras[frontal].project(landmarks_of(face_model, tracking))[1]
+    drawn: list[tuple[str, str, list[Series]]] = []
+
+    def add(title: str, unit: str, curves: dict[str, torch.Tensor], flagged: bool = False) -> None:
+        values = {name: curve.double().numpy() for name, curve in curves.items()}
+        styles = ("main", "second", "third")
+        series = [Series(name, t, curve, style) for (name, curve), style in zip(values.items(), styles, strict=False)]
+        series += [Series("flagged", t[odd], curve[odd], "second", points=True) for curve in values.values() if flagged]
+        drawn.append((title, unit, series))
+
+    residuals = timestep_residuals(tracking)
+    add("Distance of landmarks from the detected ones, pixels", "pixels", {"landmarks": residuals}, flagged=True)
+    if tracking.pixel_residuals is not None:
+        colors = 100 * tracking.pixel_residuals.nanmedian(1).values.double()
+        add("Difference of colours, %", "%", {"colours": colors}, flagged=True)
+    turns = seen_rotation(tracking, frontal).rad2deg().unbind(1)
+    add("Rotation of the head, degrees", "degrees", dict(zip(("pitch", "yaw", "roll"), turns, strict=True)))
+    add("Distance from the camera, m", "m", {"distance": depths(tracking, frontal)})
+    iris = 1e3 * iris_distances(tracking, detected, depth, frontal).double()
+    add("Distance of the irises, mm", "mm", {"irises": iris})
+    spans = tuple((float(t[one]), float(t[min(one + 1, len(t) - 1)])) for one in report["frames_without_face"])
+    return [
+        {"title": title, "chart": line_chart(series, Axes("time, s", unit, 520, 200, shaded=spans))}
+        for title, unit, series in drawn
+    ]
 
 
 def findings(tracking: Tracking, report: dict[str, Any]) -> list[tuple[str, str]]:

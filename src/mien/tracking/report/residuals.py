@@ -1,20 +1,15 @@
 """The residual report: figures and curves that show whether a tracking can be trusted."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.capture.capture import Capture
-from mien.disk.files import write_json
 from mien.face.model import FaceModel
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.landmarks.groups import BROWS, LEFT_EYELIDS, LEFT_IRIS, LIPS, NOSE, OVAL, RIGHT_EYELIDS, RIGHT_IRIS
-from mien.tracking.report.curves import Curves
 from mien.tracking.report.overlay import frontal_camera
-from mien.tracking.report.page import findings, write_report_page
 from mien.tracking.report.rig import (
     cameras_that_do_not_fit,
     front_residuals,
@@ -24,18 +19,13 @@ from mien.tracking.report.rig import (
 )
 from mien.tracking.tracking import PARTS, Tracking
 
-_FORMAT, _VERSION = "mien.residual_report", 1
 _GROUPS = {
     "oval": OVAL, "brows": BROWS, "nose": NOSE, "lips": LIPS, "eyelids": LEFT_EYELIDS + RIGHT_EYELIDS,
     "irises": LEFT_IRIS + RIGHT_IRIS,
 }  # fmt: skip
-_NEAR_FRONTAL = 0.26
-"""Largest yaw of a frame that counts as frontal: 15 degrees, in radians."""
-_MOVED = 0.03
-"""Standard deviation above which a coefficient counts as used."""
-_CHUNK = 32
-_MIN_COLOR_STEP = 0.005
-"""Least amount (0..1) by which a frame's colour residual must stand out to be flagged."""
+_NEAR_FRONTAL = 0.26  # largest yaw of a frame that counts as frontal: 15 degrees, in radians
+_MOVED = 0.03  # standard deviation above which a coefficient counts as used
+_MIN_COLOR_STEP = 0.005  # least amount (0..1) by which a frame's colour residual must stand out to be flagged
 
 
 def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel) -> dict:
@@ -48,8 +38,8 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
     `cameras` has the residuals of each camera in all its pictures, how many of them are `from_front`, and
     `misplaced_px` (`misplacements`). `shared_misfit` says how badly all cameras together fit, or is None.
     """
-    valid, frontal = tracking.valid, frontal_camera(tracking)
-    marks = _landmarks(face_model, tracking)
+    valid, frontal, assumed = tracking.valid, frontal_camera(tracking), tracking.settings.get("focal") is None
+    marks = landmarks_of(face_model, tracking)
     detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float32))
     distance = torch.stack(
         [(camera.project(marks)[0] - detected[:, c]).norm(dim=-1) for c, camera in enumerate(tracking.cameras)], dim=1
@@ -77,8 +67,8 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
         },
         "iris_distance": _constancy(iris[seen & (yaw.abs() < _NEAR_FRONTAL)]),
         "focal_px": float(tracking.cameras[frontal].K[0, 0]),
-        "focal_from": _focal_from(capture, tracking),
-        "depth_m": _summary(_depth(tracking, frontal)[valid]),
+        "focal_from": "calibrated" if capture.calibration is not None else "assumed" if assumed else "given",
+        "depth_m": _summary(depths(tracking, frontal)[valid]),
         "correlation_with_pitch": _correlations(tracking, face_model, pitch),
         "correlation_with_yaw": _correlations(tracking, face_model, yaw),
     }
@@ -91,13 +81,8 @@ def seen_rotation(tracking: Tracking, camera: int) -> Float[Tensor, "t 3"]:
     return axis_angle_from_matrix(R_seen_world @ matrix_from_axis_angle(tracking.face.head_rotation))
 
 
-def _focal_from(capture: Capture, tracking: Tracking) -> str:
-    if capture.calibration is not None:
-        return "calibrated"
-    return "assumed" if tracking.settings.get("focal") is None else "given"
-
-
-def _depth(tracking: Tracking, camera: int) -> Float[Tensor, " t"]:
+def depths(tracking: Tracking, camera: int) -> Float[Tensor, " t"]:
+    """Depths of the head in a camera, in metres."""
     return tracking.cameras[camera].project(tracking.face.head_translation)[1]
 
 
@@ -117,14 +102,14 @@ def _of_cameras(capture: Capture, tracking: Tracking, face_model: FaceModel) -> 
     return rows
 
 
-def _timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
+def timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
     """Median residual over the cameras that found the face from the front, in pixels; NaN if none found it."""
     return front_residuals(tracking).nanmedian(1).values
 
 
 def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
     """Frames with landmark or colour residuals that stand out."""
-    flagged = flagged_frames(_timestep_residuals(tracking))
+    flagged = flagged_frames(timestep_residuals(tracking))
     if tracking.pixel_residuals is not None:
         flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _MIN_COLOR_STEP)
     return flagged
@@ -143,15 +128,6 @@ def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
     if tracking.pixel_residuals is None:
         return tracking.valid
     return tracking.valid & tracking.pixel_residuals.isnan().all(1)
-
-
-def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
-    """Write residuals.json and report.html into `folder` and return the main findings as text."""
-    report = residual_report(capture, tracking, face_model)
-    write_json(folder / "residuals.json", _FORMAT, _VERSION, report)
-    curves = _curves(capture, tracking, face_model, report)
-    write_report_page(folder, capture, tracking, face_model, report, curves)
-    return " ".join(text for _, text in findings(tracking, report))
 
 
 def iris_distances(
@@ -175,9 +151,10 @@ def flagged_frames(residuals: Float[Tensor, " t"], least: float = 0.1) -> Bool[T
     return residuals > median + 4 * spread + least
 
 
-def _landmarks(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 3"]:
+def landmarks_of(face_model: FaceModel, tracking: Tracking) -> Float[Tensor, "t l 3"]:
+    """The tracked landmarks in world space, in metres."""
     with torch.no_grad():
-        parts = [tracking.face[start : start + _CHUNK] for start in range(0, len(tracking.face), _CHUNK)]
+        parts = [tracking.face[start : start + 32] for start in range(0, len(tracking.face), 32)]
         return torch.cat([face_model.landmark_positions(face_model(part), "mediapipe") for part in parts])
 
 
@@ -208,20 +185,3 @@ def _summary(values: Float[Tensor, "*n"]) -> dict[str, float | None]:
     if len(values) == 0:
         return {"median": None, "p95": None, "max": None}
     return {"median": float(values.median()), "p95": float(values.quantile(0.95)), "max": float(values.max())}
-
-
-def _curves(capture: Capture, tracking: Tracking, face_model: FaceModel, report: dict) -> Curves:
-    frontal = frontal_camera(tracking)
-    detected = torch.from_numpy(np.asarray(capture.landmarks[:, frontal], dtype=np.float32))
-    depth = tracking.cameras[frontal].project(_landmarks(face_model, tracking))[1]
-    colors = tracking.pixel_residuals
-    return Curves(
-        np.asarray(capture.timestamps, dtype=np.float64),
-        _timestep_residuals(tracking).double().numpy(),
-        None if colors is None else colors.nanmedian(1).values.double().numpy(),
-        seen_rotation(tracking, frontal).rad2deg().double().numpy(),
-        _depth(tracking, frontal).double().numpy(),
-        1e3 * iris_distances(tracking, detected, depth, frontal).double().numpy(),
-        report["flagged_frames"],
-        report["frames_without_face"],
-    )

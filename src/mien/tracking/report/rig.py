@@ -23,7 +23,6 @@ of its picture's longer side."""
 _MISFIT, _SUSPECT = 0.02, 0.01
 """Median distance of landmarks, as a share of the face's side, from which a calibration as a whole does not fit, and
 from which it does not if another reading of it fits far better."""
-_CHUNK = 32
 
 
 def seen_from_front(tracking: Tracking) -> Bool[Tensor, "t c"]:
@@ -63,8 +62,8 @@ def misplacements(capture: Capture, tracking: Tracking, face_model: FaceModel) -
     """
     detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float32))
     shifts: list[list[Tensor]] = [[] for _ in tracking.cameras]
-    for start in range(0, len(tracking.face), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(tracking.face), 32):
+        part = slice(start, start + 32)
         vertices = face_model(tracking.face[part])
         marks = face_model.landmark_positions(vertices, "mediapipe")
         for index, camera in enumerate(tracking.cameras):

@@ -17,12 +17,11 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.machine.parallel import map_in_threads
-from mien.tracking.eyelids.colors import EyeColors, learn_colors
-from mien.tracking.eyelids.crops import EyeCrop, eye_crop
-from mien.tracking.eyelids.eyes import Eye, eyes_of
 from mien.tracking.fitting.fit import Fit, SequenceFit
-from mien.tracking.fitting.shot import Shot
+from mien.tracking.fitting.sequence import SequenceData
 from mien.tracking.landmarks.model import LandmarkModel
+from mien.tracking.pixels.eye_colors import EyeCrop, eye_crop, learn_colors
+from mien.tracking.pixels.eyes import Eye, eyes_of
 
 _POSITION_RANGE = (-0.4, 1.2)
 """First and last of the positions of the lids that are tried: 0 is at rest, 1 is closed, below 0 is wider open than at
@@ -40,42 +39,31 @@ _FIT_SIGMA = 0.12  # standard deviation of the lids of a good fit. Chosen with t
 _OFFSET_SIGMA = 0.4
 """Wider standard deviation of the fit's lids, for the estimate of the usual offset between colours and fit."""
 _LEARNING_PICTURES = 100  # largest number of pictures that colours are learned from
-_LEAST_PICTURES = 10  # fewest pictures that must show an eye for its lids to be placed
 _LEAST_FACING = 0.35  # smallest cosine between an eye's direction and the direction to the camera
 
 
-def place_lids(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    fit: Fit,
-    weight: float,
-) -> Fit:
-    """Return the fit with the lids placed from the pictures.
+def place_lids(model: LandmarkModel, sequences: Sequence[SequenceData], fit: Fit, weight: float) -> Fit:
+    """Return the fit with the lids placed from the pictures, which weigh 1 against the fit as measured, or 0 for none.
 
     Lids stay as they are if the model cannot close them or the eyes are too small in the pictures.
-
-    Args:
-        model: The face model reduced to its landmarks.
-        shots: The sequences.
-        fit: The fit of the sequences. Everything but the lids stays as it is.
-        weight: Weight of the pictures against the fit: 1 as measured, 0 for the fit alone.
     """
     eyes = eyes_of(model.face_model.to(torch.zeros(())), model.layout) if weight > 0 else []
-    sequences = []
-    for shot, own in zip(shots, fit.sequences, strict=True):
-        if eyes:
-            own = replace(own, state=_place(_Sequence(model, shot, fit, own, eyes), weight))
-        sequences.append(own)
-    return replace(fit, sequences=tuple(sequences))
+    if not eyes:
+        return fit
+    placed = [
+        replace(sequence, state=_place(_Sequence(model, data, fit, sequence, eyes), weight))
+        for data, sequence in zip(sequences, fit.sequences, strict=True)
+    ]
+    return replace(fit, sequences=tuple(placed))
 
 
 class _Sequence:
     """The pictures of one sequence and its fit so far."""
 
-    def __init__(self, model: LandmarkModel, shot: Shot, fit: Fit, own: SequenceFit, eyes: Sequence[Eye]):
-        self.model, self.shot, self.fit, self.own, self.eyes = model, shot, fit, own, eyes
+    def __init__(self, model: LandmarkModel, data: SequenceData, fit: Fit, own: SequenceFit, eyes: Sequence[Eye]):
+        self.model, self.data, self.fit, self.own, self.eyes = model, data, fit, own, eyes
         self.face_model = model.face_model.to(torch.zeros(()))
-        self.timesteps = shot.valid.nonzero()[:, 0].tolist()
+        self.timesteps = data.timesteps.tolist()
 
     def crops(self, row: int, positions: list[float]) -> list[EyeCrop | None]:
         """The crop of each eye, in the picture of the camera that the eye faces most directly."""
@@ -96,8 +84,8 @@ class _Sequence:
         positions: list[float],
     ) -> EyeCrop | None:
         middle = corners[0].mean(0)
-        capture, best, facing = self.shot.capture, None, _LEAST_FACING
-        for index in self.shot.views.seen_by(row):
+        capture, best, facing = self.data.capture, None, _LEAST_FACING
+        for index in self.data.views.seen_by(row):
             K, viewmat = self.own.cameras.K[index].float(), self.own.cameras.viewmat[index].float()
             camera = Camera(K, viewmat, capture.width, capture.height)
             towards = camera.position - middle
@@ -112,44 +100,23 @@ class _Sequence:
 
 
 def _place(sequence: _Sequence, weight: float) -> Float[Tensor, "v p"]:
-    state = sequence.own.state.clone()
-    colors, positions = _learn(sequence), _positions().tolist()
+    state, positions = sequence.own.state.clone(), np.linspace(*_POSITION_RANGE, _POSITIONS).tolist()
+    several = torch.linspace(0, len(state) - 1, min(_LEARNING_PICTURES, len(state))).round().long().unique()
+    learned = map_in_threads(lambda row: sequence.crops(row, positions[:1]), several.tolist())
+    colors = [learn_colors([crop for crop in of_eye if crop is not None]) for of_eye in zip(*learned, strict=True)]
 
-    def of_row(row: int) -> list[Float[np.ndarray, " k"] | None]:
-        crops = sequence.crops(row, positions)
-        return [_costs(*pair) for pair in zip(crops, colors, strict=True)]
+    def costs_of(row: int) -> list[Float[np.ndarray, " k"] | None]:
+        pairs = zip(sequence.crops(row, positions), colors, strict=True)
+        return [None if crop is None or of_eye is None else of_eye.costs(crop, _EDGE_BAND) for crop, of_eye in pairs]
 
-    costs = map_in_threads(of_row, list(range(len(state))))
-    for number, eye in enumerate(sequence.eyes):
-        of_eye = [row[number] for row in costs]
-        seen = np.array([cost is not None for cost in of_eye])
-        if seen.sum() >= _LEAST_PICTURES:
-            known = np.stack([cost for cost in of_eye if cost is not None])
-            before = state[torch.from_numpy(seen), eye.column].numpy() / eye.closed
-            state[torch.from_numpy(seen), eye.column] = (
-                torch.from_numpy(weigh_positions(known, before, weight)) * eye.closed
-            )
+    rows = map_in_threads(costs_of, list(range(len(state))))
+    for eye, of_eye in zip(sequence.eyes, zip(*rows, strict=True), strict=True):
+        seen = torch.tensor([cost is not None for cost in of_eye])
+        if seen.sum() >= 10:  # fewest pictures that must show an eye for its lids to be placed
+            costs = np.stack([cost for cost in of_eye if cost is not None])
+            before = state[seen, eye.column].numpy() / eye.closed
+            state[seen, eye.column] = torch.from_numpy(weigh_positions(costs, before, weight)) * eye.closed
     return sequence.model.layout.bounds.clip(state)
-
-
-def _positions() -> Float[np.ndarray, " k"]:
-    return np.linspace(*_POSITION_RANGE, _POSITIONS)
-
-
-def _costs(crop: EyeCrop | None, colors: EyeColors | None) -> Float[np.ndarray, " k"] | None:
-    return None if crop is None or colors is None else colors.costs(crop, _EDGE_BAND)
-
-
-def _learn(sequence: _Sequence) -> list[EyeColors | None]:
-    """The colours of each eye, or None for an eye that is seen too little."""
-    timesteps = len(sequence.own.state)
-    rows = torch.linspace(0, timesteps - 1, min(_LEARNING_PICTURES, timesteps))
-    ends = [_POSITION_RANGE[0]]
-    crops = map_in_threads(lambda row: sequence.crops(row, ends), rows.round().long().unique().tolist())
-    return [
-        learn_colors([crop for row in crops if (crop := row[number]) is not None])
-        for number in range(len(sequence.eyes))
-    ]
 
 
 def weigh_positions(
@@ -161,7 +128,7 @@ def weigh_positions(
     at the usual position and vanishes where the lids meet. If the colours contradict the fit in many frames, they count
     for little in all frames.
     """
-    positions = _positions()
+    positions = np.linspace(*_POSITION_RANGE, _POSITIONS)
     fine = np.arange(positions[0], positions[-1] + _FINE_STEP / 2, _FINE_STEP)
     near = np.exp(-0.5 * ((fine[:, None] - positions) / _COST_BLUR) ** 2)
     costs = costs @ (near / near.sum(1, keepdims=True)).T

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_opening
 from torch import Tensor
 
 from mien.camera import Camera
@@ -35,7 +36,7 @@ _FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class SequenceData:
     """The input of one sequence to a fit."""
 
     views: Views
@@ -48,6 +49,11 @@ class Shot:
     capture: Capture
     T_world_fit: Float[Tensor, "4 4"] | None
     """Transform from the frame of the fit to the calibrated world; None if they are the same."""
+
+    @property
+    def timesteps(self) -> Int[Tensor, " v"]:
+        """The timesteps with a face."""
+        return self.valid.nonzero()[:, 0]
 
     def cameras_in_world(self, fitted: CameraBatch) -> tuple[Camera, ...]:
         """The cameras of the tracking: the calibrated ones, or those with the fitted focal length."""
@@ -63,7 +69,7 @@ def has_enough_faces(capture: Capture) -> bool:
     return int(_seen(capture).any(1).sum()) >= _MIN_FRAMES
 
 
-def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
+def sequence_data(capture: Capture, settings: TrackingSettings) -> SequenceData:
     """Make the input of a fit from a capture."""
     cameras = len(capture.camera_ids)
     if cameras != 1 and capture.calibration is None:
@@ -89,16 +95,16 @@ def shot_of(capture: Capture, settings: TrackingSettings) -> Shot:
         batch = batch_of(capture.calibration)
         T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ _FACING
         batch = CameraBatch(batch.K, batch.viewmat @ T_world_fit)
-    return Shot(views, valid, batch, capture.fps, capture, T_world_fit)
+    return SequenceData(views, valid, batch, capture.fps, capture, T_world_fit)
 
 
 @contextmanager
-def explaining_singular(shots: Sequence[Shot]) -> Iterator[None]:
+def explaining_singular(sequences: Sequence[SequenceData]) -> Iterator[None]:
     """Turn equations of landmarks that have no solution into an error that names the sequences."""
     try:
         yield
     except torch.linalg.LinAlgError:
-        names = ", ".join(shot.capture.name for shot in shots)
+        names = ", ".join(data.capture.name for data in sequences)
         raise UserError(
             f"{names}: no face fits the landmarks; check the pictures, then capture the video again"
         ) from None
@@ -110,33 +116,19 @@ def _seen(capture: Capture) -> Bool[Tensor, "t c"]:
     return torch.from_numpy(np.asarray(capture.valid, dtype=bool) & finite)
 
 
-def lenses_of(captures: Sequence[Capture], settings: TrackingSettings) -> list[int | None]:
-    """The number of the unknown focal length of each capture; None if the focal length is known."""
-    lenses: list[int | None] = []
-    free = 0
-    for capture in captures:
-        if capture.calibration is not None or settings.focal is not None:
-            lenses.append(None)
-        else:
-            lenses.append(0 if settings.same_camera else free)
-            free += 1
-    return lenses
-
-
 def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
-    """The camera of the captured pictures, with the given or an assumed focal length, in float64."""
-    focal_x, focal_y = _source_focal(capture) if settings.focal is None else (settings.focal, settings.focal)
-    x, y = (float(value) for value in capture.principal_point[0])
-    K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, _FACING.clone(), capture.width, capture.height)
+    """The camera of the captured pictures, which may be a scaled crop of the source, in float64.
 
-
-def _source_focal(capture: Capture) -> tuple[float, float]:
-    """The assumed focal lengths along x and y, in pixels of the capture, which may be a scaled crop of the source."""
+    The focal length is the given one, or one that is assumed for the whole picture of the source.
+    """
     crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
     sides = capture.source.get("picture_size", (crop["width"], crop["height"]))
     assumed = (_CROPPED_FOCAL if max(sides) < _SQUARE * min(sides) else FOCAL) * float(max(sides))
-    return assumed * capture.width / crop["width"], assumed * capture.height / crop["height"]
+    focal = assumed * capture.width / crop["width"], assumed * capture.height / crop["height"]
+    focal_x, focal_y = focal if settings.focal is None else (settings.focal, settings.focal)
+    x, y = (float(value) for value in capture.principal_point[0])
+    K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
+    return Camera(K, _FACING.clone(), capture.width, capture.height)
 
 
 def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c"]) -> Float[Tensor, "t c l 2"]:
@@ -144,11 +136,8 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
 
     A detector that crops each picture by its last answer can swing between two answers. If nothing moves, the crop of
     the next picture depends on the last answer and the answer on the crop, so landmarks may go to and fro for ever. No
-    part of a face does that: none moves up in one frame and down in the next, again and again.
-
-    Args:
-        landmarks: Landmarks in pixels; any value where not seen.
-        seen: Whether the camera found a face.
+    part of a face does that: none moves up in one frame and down in the next, again and again. Landmarks may have any
+    value where a camera has not `seen` a face.
     """
     if len(landmarks) < _SWING_FRAMES + 2:
         return landmarks
@@ -157,7 +146,7 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
     swings = torch.zeros_like(seen)
     swings[1:-1] = across < _SWING * (steps[1:] + steps[:-1])  # False for NaN
     swings[1:-1] &= seen[:-2] & seen[1:-1] & seen[2:]
-    runs = _of_runs(swings)
+    runs = torch.from_numpy(binary_opening(swings.numpy(), np.ones((_SWING_FRAMES, 1), bool)))
     # The frames at both ends of a run swing too, but with only one of their neighbours.
     linked = (runs[:-1] | runs[1:])[..., None, None]
     forward = torch.where(linked, landmarks[1:] - landmarks[:-1], 0.0)
@@ -167,12 +156,3 @@ def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c
     neighbors[:-1] += linked
     neighbors[1:] += linked
     return landmarks + towards / (2 * neighbors.clamp_min(1))
-
-
-def _of_runs(swings: Bool[Tensor, "t c"]) -> Bool[Tensor, "t c"]:
-    """Return which swings belong to a run that is long enough."""
-    whole = swings.unfold(0, _SWING_FRAMES, 1).all(-1)
-    kept = torch.zeros_like(swings)
-    for shift in range(_SWING_FRAMES):
-        kept[shift : shift + len(whole)] |= whole
-    return kept

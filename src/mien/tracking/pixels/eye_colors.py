@@ -1,5 +1,12 @@
-"""Pixels of a picture around an eye: their colours, and how much of each is eyeball as the lids move."""
+"""Colours of a person's eyeballs and of the skin around them, and how well positions of the lids explain a picture.
 
+Two palettes are learned from the clip itself, from frames in which the lids are tracked open: one of the eyeball, one
+of its surroundings, with lashes and folds. A position of the lids makes each pixel eyeball, edge of a lid, or plain
+skin. Lashes are as dark as irises but occur only near the edge of a lid, so an open eye is not mistaken for a closed
+one full of lashes.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,21 +17,25 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.render.mesh import rasterize_mesh
-from mien.tracking.eyelids.eyes import Eye
+from mien.tracking.pixels.eyes import Eye
+from mien.tracking.pixels.texture import LEAST_COSINE
 
-LEAST_COSINE = 0.25
-"""Least cosine between the surface's normal and the direction to the camera at which the surface's colour is used."""
-
-_WIDEST_EYE = 40  # largest width of an eyeball, in pixels. If it is wider, the picture is scaled down
-_NARROWEST_EYE = 20  # smallest width of an eyeball, in pixels. Narrower eyeballs show too little and are skipped
 _SUPERSAMPLING = 2
 """Multiple of the picture's size at which the mesh is drawn, so that edges of lids can lie between pixels."""
-_EYE_MARGIN = 2  # margin around the eyeball, in pixels
-_RING = 0.3  # width of the ring of skin around the eye, in widths of the opening
 _RING_BLUR = 0.18  # standard deviation of the blur of the ring's colour, in widths of the opening
-_LEAST_RING = 12  # fewest pixels of the ring of skin. With fewer the eye is skipped
-_LEAST_OPENING = 12  # fewest pixels of the opening of the eye. With fewer the eye is skipped
+_LEAST_PIXELS = 12  # fewest pixels of the ring of skin, and of the opening of the eye. With fewer the eye is skipped
 _DARKEST = 0.03  # value added to colours (0..1) before the logarithm, so that noise in dark pixels does not matter
+_EYE_COLORS = 6  # number of colours in the palette of the eyeball
+_EDGE_COLORS = 8  # number of colours in the palette of the edge of the lids
+_PALETTE_SAMPLES = 20_000  # largest number of pixels, about, that a palette is learned from
+_COLOR_SIGMA = 0.15  # standard deviation of logarithms of colours about each colour of a palette
+_SKIN_SIGMA = 0.15
+"""The same of plain skin on the lids, in addition to the spread of the skin around the eye. Wider, lids are 0.2 too
+open, because lashes are as dark as pupils (log)."""
+_EDGE_SHARE = 0.1  # share of plain skin that may have any colour of the edge palette: moles, folds, make-up
+_EYE_SHARE = 0.2
+"""Share of the edge of a lid that may have any colour of the eyeball palette: lashes are as dark as pupils."""
+_OTHER_DENSITY = 0.05  # density of all other colours, such as reflections and frames of glasses
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +62,12 @@ def eye_crop(
     tracked: float,
     positions: list[float],
 ) -> EyeCrop | None:
-    """The pixels of an eye in a picture, or None if the picture shows too little of it.
+    """The pixels of an eye in a picture (sRGB), or None if the picture shows too little of it.
 
     Args:
         eye: The eye.
-        picture: The picture, sRGB.
-        camera: The camera that took the picture.
+        picture: The picture.
+        camera: Its camera.
         corners: The eye's vertices in world space with the lids at rest (position 0) and closed (position 1).
         tracked: Tracked position of the lids, on the same scale.
         positions: Possible positions of the lids, the most open first.
@@ -73,9 +84,9 @@ def eye_crop(
     uncovered = np.stack([_uncovered(eye, at(position), sharper) for position in [*positions, tracked]])
     skin, hidden = _around(eye, at(tracked), view)
     opening = uncovered.max(0) > 1 / 64
-    difference, spread = _without_skin(_logarithms(image), opening, skin & inside_picture)
+    difference, spread = _without_skin(np.log(image + np.float32(_DARKEST)), opening, skin & inside_picture)
     kept = opening & ~hidden & inside_picture
-    if difference is None or kept.sum() < _LEAST_OPENING:
+    if difference is None or kept.sum() < _LEAST_PIXELS:
         return None
     open_now = uncovered[-1]
     kernel = np.ones((3, 3), np.uint8)
@@ -94,11 +105,11 @@ def _part(
     points, depth = camera.project(ball)
     if not (depth > 0).all():
         return None
-    left, top = (points.amin(0).floor().long() - _EYE_MARGIN).tolist()
-    right, bottom = (points.amax(0).ceil().long() + _EYE_MARGIN).tolist()
+    left, top = (points.amin(0).floor().long() - 2).tolist()
+    right, bottom = (points.amax(0).ceil().long() + 2).tolist()
     width, height = right - left, bottom - top
-    least, most = _NARROWEST_EYE, _WIDEST_EYE
-    if width < least or left >= camera.width or top >= camera.height or right <= 0 or bottom <= 0:
+    most = 40  # a wider eyeball, in pixels, is scaled down; one narrower than 20 shows too little
+    if width < 20 or left >= camera.width or top >= camera.height or right <= 0 or bottom <= 0:
         return None
     part = picture[max(top, 0) : bottom, max(left, 0) : right]
     after = max(bottom - camera.height, 0), max(right - camera.width, 0)
@@ -134,10 +145,6 @@ def _around(
     return skin.numpy(), (seen >= eye.lids).numpy()
 
 
-def _logarithms(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    return np.log(image + np.float32(_DARKEST))
-
-
 def _without_skin(
     colors: Float[np.ndarray, "h w 3"], opening: Bool[np.ndarray, "h w"], skin: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w 3"] | None, float]:
@@ -147,12 +154,12 @@ def _without_skin(
     """
     columns = np.flatnonzero(opening.any(axis=0))
     width = max(int(np.ptp(columns)) if len(columns) else 0, 6)
-    reach = 2 * max(int(_RING * width), 3) + 1
+    reach = 2 * max(int(0.3 * width), 3) + 1  # width of the ring of skin around the eye, in widths of the opening
     near, touching = (
         cv2.dilate(opening.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for size in (reach, 3)
     )  # fmt: skip
     ring = near & ~touching & skin
-    if ring.sum() < _LEAST_RING:
+    if ring.sum() < _LEAST_PIXELS:
         return None, 0.0
     middle = np.median(colors[ring], axis=0)
     away = np.abs(colors - middle).sum(-1)
@@ -163,3 +170,73 @@ def _without_skin(
     difference = colors - (summed + 1e-4 * middle) / (total + 1e-4)
     spread = float(np.sqrt(((difference**2).sum(-1) * weight).sum() / weight.sum()))
     return difference.astype(np.float32), spread
+
+
+@dataclass(frozen=True, eq=False)
+class Palette:
+    """A mixture of k isotropic normal distributions of colours."""
+
+    means: Float[np.ndarray, "k 3"]
+    shares: Float[np.ndarray, " k"]
+
+    def density(self, colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Density of each colour, up to a factor that is the same for all densities in this module."""
+        squared = ((colors[:, None] - self.means) ** 2).sum(-1)
+        return (self.shares * _normal(squared, _COLOR_SIGMA)).sum(1)
+
+
+@dataclass(frozen=True, eq=False)
+class EyeColors:
+    """Colours of one eye of one person, as differences of logarithms from the skin around the eye."""
+
+    eyeball: Palette
+    edge: Palette
+    skin_sigma: float
+
+    def costs(self, crop: EyeCrop, band: int) -> Float[np.ndarray, " k"]:
+        """Negative log-likelihood of the pixels at each of the k positions of the lids, up to a constant.
+
+        At each position, pixels that were eyeball up to `band` positions earlier are the edge of the upper lid.
+        """
+        edge = self.edge.density(crop.colors)
+        plain = _normal((crop.colors**2).sum(1), self.skin_sigma)
+        skin = np.log((1 - _EDGE_SHARE) * plain + _EDGE_SHARE * edge + _OTHER_DENSITY)
+        eyeball = self.eyeball.density(crop.colors)
+        for_eyeball = np.log(eyeball + _OTHER_DENSITY) - skin
+        for_edge = np.log((1 - _EYE_SHARE) * edge + _EYE_SHARE * eyeball + _OTHER_DENSITY) - skin
+        open_now = crop.uncovered
+        before = open_now[np.maximum(np.arange(len(open_now)) - band, 0)]
+        return -(open_now @ for_eyeball + (before - open_now).clip(0, 1) @ for_edge)
+
+
+def learn_colors(crops: Sequence[EyeCrop]) -> EyeColors | None:
+    """Learn the colours of an eye from pictures, most of which are tracked with about the right position of the lids.
+
+    Returns None if there are too few pixels.
+    """
+    inside, beside = (
+        np.concatenate([crop.colors[getattr(crop, name)] for crop in crops] or [np.zeros((0, 3), np.float32)])
+        for name in ("inside", "beside")
+    )
+    if min(len(inside), len(beside)) < 100:  # fewest pixels of each kind that a palette is learned from
+        return None
+    spread = float(np.median([crop.spread for crop in crops]))
+    return EyeColors(_palette(inside, _EYE_COLORS), _palette(beside, _EDGE_COLORS), (spread**2 + _SKIN_SIGMA**2) ** 0.5)
+
+
+def _normal(squared: Float[np.ndarray, "..."], sigma: float) -> Float[np.ndarray, "..."]:
+    return np.exp(-squared / (2 * sigma**2)) / sigma**3
+
+
+def _palette(colors: Float[np.ndarray, "n 3"], count: int) -> Palette:
+    """A palette found by k-means, which starts from equal parts of the colours in the order of brightness."""
+    colors = colors[:: max(len(colors) // _PALETTE_SAMPLES, 1)].astype(np.float64)
+    order = np.array_split(colors[colors.sum(1).argsort(kind="stable")], count)
+    means = np.stack([part.mean(0) for part in order])
+    nearest = np.zeros(len(colors), int)
+    for _ in range(20):  # rounds in which a palette's colours move to the middle of their pixels
+        nearest = ((colors[:, None] - means) ** 2).sum(-1).argmin(1)
+        means = np.stack([
+            colors[nearest == index].mean(0) if (nearest == index).any() else means[index] for index in range(count)
+        ])  # fmt: skip
+    return Palette(means, np.bincount(nearest, minlength=count) / len(colors))

@@ -1,8 +1,9 @@
-"""The steps before the global epochs of the `paper` schedule: the pass along the frames, then texture and light."""
+"""The `paper` schedule: gradient descent over all frames in random order, which starts from the result of `fast`."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,11 +13,13 @@ from torch import Tensor
 from mien.adam import Moments
 from mien.face.params import most_frontal_camera
 from mien.machine.progress import Advance
-from mien.tracking.descent.adam import apply_adam
-from mien.tracking.descent.epochs import Descent
+from mien.tracking.descent.epochs import RATES, Descent, apply_adam
+from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene
 from mien.tracking.descent.terms import (
+    COLOR_EPSILON,
     Target,
     color_term,
+    face_of,
     guess_texture,
     landmark_terms,
     light_term,
@@ -25,27 +28,109 @@ from mien.tracking.descent.terms import (
     visibility_of,
     without_smooth_difference,
 )
+from mien.tracking.fitting.fit import Fit, show_progress
 from mien.tracking.fitting.resume import StageCache
+from mien.tracking.landmarks.problem import Problem
+from mien.tracking.pixels.texture import PhotometricFit, SkinTexture, texture_space
 
 _LAST_RATE = 0.1  # factor of the learning rates at the last of a frame's steps
 _TEXTURE_GAIN = 0.15
 """Cosine by which a frame must see a triangle more frontally than earlier frames for its texels to be learned again."""
 _TEXTURE_LEAST_COSINE = 0.1  # least cosine of the viewing angle at which a frame's texels are learned at all
 _TEXTURE_FRAMES = 40  # number of frames of each sequence from which texture and light are fitted before the epochs
-_TEXTURE_ROUNDS = 6  # number of steps at each of these frames
 _LOST_LANDMARKS = 3.0  # standard deviations by which landmarks must be farther off than in their own fit to be lost
-_LIGHT_EVERY = 10  # number of a frame's steps between estimates of the unexplained light in its pictures
 _FIRST_CONVERGED = 0.01  # share by which a turn of the very first frame's steps must lower its cost for another turn
 _FIRST_MOST_TURNS = 8  # largest number of turns. One alone leaves vertices 1.51 mm off instead of 1.48 on drawn frames
-_FURTHER_START_DIVISOR = 5
-"""The first frames of further sequences get the first frame's number of steps divided by this."""
+
+
+def fit_by_descent(
+    problem: Problem, fit: Fit, refined: PhotometricFit | None = None, known: PhotometricFit | None = None
+) -> PhotometricFit:
+    """Refine a fit as in the supplement of GaussianAvatars, section A.
+
+    The global epochs run at the end. If the settings start from landmarks, the pass along the frames runs first. A
+    frame whose landmarks get lost in that pass keeps its fit to landmarks and is not `improved`.
+
+    Args:
+        problem: The sequences, and how they are fitted.
+        fit: The fit to landmarks, or that of the schedule `fast`.
+        refined: `fit` with texture and light, if it was fitted to pixels.
+        known: The result for other sequences of the person. Then only motion is fitted, each frame from its own
+            landmarks; subject, cameras, texture and light stay. `refined` has the cameras and lights to keep, and the
+            bias of its subject is without the effect of vertex offsets.
+    """
+    if refined is not None and not (refined.texture.trust > 0).any():
+        return refined  # The pictures show nothing to fit to.
+    if refined is not None and known is not None:
+        fit = replace(fit, subject=replace(fit.subject, identity=known.fit.subject.identity))
+        refined = replace(refined, fit=fit, texture=known.texture)
+    scene = paper_scene(problem, fit, refined)
+    descent = Descent(scene, first_state(scene, fit, refined), fixed_person=known is not None)
+    if known is not None:
+        state = descent.state
+        state.visibility = torch.ones_like(state.visibility)  # The texture's trust is in the scene's weights.
+        if known.fit.subject.vertex_offsets is not None:
+            state.offsets = known.fit.subject.vertex_offsets.clone()
+    descent.resume(problem.cache)
+    if problem.settings.paper.start == "fast":
+        descent.done = max(descent.done, descent.frames)
+
+    def outcome() -> PhotometricFit:
+        moved = _as_photometric(scene, descent, fit, refined)
+        if known is None or refined is None:
+            return moved
+        fixed = replace(moved.fit, subject=known.fit.subject)
+        return replace(moved, fit=fixed, texture=known.texture, lights=refined.lights)
+
+    title = "Refining by descent" if known is None else "Refining held-out sequences by descent"
+    total = descent.frames * (1 + problem.settings.paper.epochs)
+    done = min(descent.done, total)
+    with torch.enable_grad(), show_progress(title, "pixels", total, problem.callback, done) as progress:
+        advance = partial(progress.advance, current=outcome)
+        for sequence in range(len(problem.data)):
+            fit_sequence(descent, sequence, advance, problem.cache)
+        if descent.done == descent.frames and known is None:
+            recenter(descent) if refined is None else measure_visibility(descent)
+            fit_appearance(descent)
+        for epoch in range(problem.settings.paper.epochs):
+            descent.fit_epoch(epoch, advance, problem.cache)
+    return outcome()
+
+
+def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: PhotometricFit | None) -> PhotometricFit:
+    """The fit with texture and light. Each texel has the trust of its triangle."""
+    state, fit = descent.state, _as_fit(scene, descent.state, fit)
+    fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
+    trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
+    improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]
+    if refined is not None:
+        improved = [own.clone() for own in refined.improved]
+    for sequence, row in descent.lost:
+        improved[sequence][row] = False
+    appearance = SkinTexture(state.texture, trust, COLOR_EPSILON)
+    return PhotometricFit(fit, appearance, tuple(state.lights), tuple(improved))
+
+
+def _as_fit(scene: PaperScene, state: PaperState, fit: Fit) -> Fit:
+    """The state as a fit to landmarks. The effect of the offsets on landmarks is added to the bias."""
+    with torch.no_grad():
+        offsets = state.offsets if scene.settings.offset_sigma > 0 else None
+        moved = scene.landmarks.positions(state.offsets, scene.mesh.faces).double()
+    subject = replace(
+        fit.subject, identity=state.identity.double(), bias=fit.subject.bias + moved, vertex_offsets=offsets
+    )
+    sequences = []
+    for own, was, rows in zip(scene.sequences, fit.sequences, state.frames, strict=True):
+        factor = 1.0 if own.lens is None else float(state.log_focals[own.lens].exp())
+        sequences.append(replace(was, cameras=was.cameras.with_focal(factor), state=rows.double()))
+    return Fit(subject, tuple(sequences))
 
 
 def fit_appearance(descent: Descent) -> None:
     """Fit texture and light again, all else fixed, to frames spread over the sequences, in random order."""
     chosen = _some_frames(descent)
     moments: dict[str, Moments] = {}
-    order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), _TEXTURE_ROUNDS))
+    order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), 6))  # steps at each
     for number, index in enumerate(order):
         _step_appearance(descent, descent.targets(*chosen[index]), moments, _fading(number, len(order)))
 
@@ -70,40 +155,38 @@ def _some_frames(descent: Descent) -> list[tuple[int, int]]:
 def _step_appearance(descent: Descent, targets: Sequence[Target], moments: dict[str, Moments], rate: float) -> None:
     scene, state, target = descent.scene, descent.state, targets[0]
     moving, leaves = descent.moving(target, ("texture", "light"))
-    vertices, _ = pose_vertices(scene, moving)
+    vertices = pose_vertices(scene, moving)
     colors = [color_term(scene, one, moving, vertices, descent.trusted()) for one in targets]
-    loss = torch.stack(colors).mean() + light_term(scene, moving.light)
+    loss = torch.stack(colors).mean() + light_term(moving.light)
     by_texture, by_light = torch.autograd.grad(loss, list(leaves.values()))
-    rates, light = scene.settings.rates, state.lights[target.sequence]
+    light = state.lights[target.sequence]
     with torch.no_grad():
-        by_texture += roughness_gradient(scene, state.texture)
+        by_texture += roughness_gradient(state.texture)
         of_texture = moments.setdefault("texture", Moments.zeros(by_texture))
-        apply_adam(of_texture, state.texture, by_texture, rate * rates.texture)
+        apply_adam(of_texture, state.texture, by_texture, rate * RATES["texture"])
         of_light = moments.setdefault(f"light_{target.sequence}", Moments.zeros(light))
-        apply_adam(of_light, light, by_light, rate * rates.light)
+        apply_adam(of_light, light, by_light, rate * RATES["lights"])
 
 
-def fit_sequence(
-    descent: Descent, sequence: int, advance: Advance, cache: StageCache, known_person: bool = False
-) -> None:
+def fit_sequence(descent: Descent, sequence: int, advance: Advance, cache: StageCache) -> None:
     """Fit the first frame to convergence, then each next frame from the one before it, moved as its landmarks moved.
 
-    If person and texture are known, each frame is fitted from its own landmarks.
+    If only frames move, each frame is fitted from its own landmarks.
     """
     rows, start = descent.state.frames[sequence], descent.start[sequence]
     before = sum(len(own) for own in descent.state.frames[:sequence])
     for row in range(max(descent.done - before, 0), len(rows)):
         targets = descent.targets(sequence, row)
-        if row == 0 and not known_person:
+        if row == 0 and not descent.fixed_person:
             fit_first(descent, targets, first_of_all=sequence == 0)
         else:
-            if not known_person:
-                rows[row] = descent.within(rows[row - 1] + start[row] - start[row - 1])
+            if not descent.fixed_person:
+                rows[row] = descent.bounds.clip(rows[row - 1] + start[row] - start[row - 1])
             fit_row(descent, targets, descent.scene.settings.steps)
             if _is_lost(descent, targets[0]):
                 rows[row] = start[row]
                 descent.lost.append((sequence, row))
-        for one in [] if known_person else targets:
+        for one in [] if descent.fixed_person else targets:
             _learn_texture(descent, one)
         descent.done += 1
         advance(status=f"frame {row + 1} of {len(rows)}")
@@ -117,7 +200,7 @@ def recenter(descent: Descent) -> None:
     difference from the fit to landmarks over all frames is that error, because the errors of all landmarks average out.
     """
     for rows, was in zip(descent.state.frames, descent.start, strict=True):
-        rows.copy_(descent.within(rows + (was - rows).median(0).values))
+        rows.copy_(descent.bounds.clip(rows + (was - rows).median(0).values))
 
 
 @torch.no_grad()
@@ -134,9 +217,9 @@ def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -
     """Fit the first frame of a sequence. The very first one has turns until its cost no longer falls."""
     settings = descent.scene.settings
     if not first_of_all:
-        turn_of_first(descent, targets, settings.first_steps // _FURTHER_START_DIVISOR, appearance_first=True)
+        turn_of_first(descent, targets, settings.first_steps // 5, appearance_first=True)
         return
-    _, face = pose_vertices(descent.scene, descent.moving(targets[0], ())[0])
+    face = face_of(descent.scene, descent.moving(targets[0], ())[0])
     cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
     frontal = targets[most_frontal_camera(cameras, face)]
     guess_texture(descent.scene, frontal, descent.moving(frontal, ())[0], descent.state.texture)
@@ -152,21 +235,22 @@ def turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appea
     """Fit a first frame with texture and light, and return the mean cost of the last tenth of the steps."""
     scene, target, costs = descent.scene, targets[0], []
     appearance = {"texture": descent.state.texture, "light": descent.state.lights[target.sequence]}
+    rates = {"texture": RATES["texture"], "light": RATES["lights"]}
     moments = {name: Moments.zeros(value) for name, value in appearance.items()}
     stepper = descent.stepper(target.sequence, target.row, smoothness=0.0)
     for step in range(steps):
         rate = _fading(step, steps)
         names = ("texture", "light") if appearance_first and 2 * step < steps else ("row", "texture", "light")
         moving, leaves = descent.moving(target, names)
-        loss = descent.frame_cost(targets, moving, scene.used, None) + light_term(scene, moving.light)
+        loss = descent.frame_cost(targets, moving, scene.used, None) + light_term(moving.light)
         gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
         costs.append(float(loss.detach()))
         with torch.no_grad():
-            gradients["texture"] = gradients["texture"] + roughness_gradient(scene, moving.texture)
+            gradients["texture"] = gradients["texture"] + roughness_gradient(moving.texture)
             for name, value in appearance.items():
-                apply_adam(moments[name], value, gradients[name], rate * getattr(scene.settings.rates, name))
+                apply_adam(moments[name], value, gradients[name], rate * rates[name])
             if "row" in leaves:
-                stepper.step(gradients["row"], rate * scene.settings.rates.frame)
+                stepper.step(gradients["row"], rate * RATES["row"])
     last = costs[-max(1, steps // 10) :]
     return sum(last) / max(len(last), 1)
 
@@ -174,16 +258,16 @@ def turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appea
 def fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
     """Fit the pose and expression of a frame, all else fixed."""
     sequence, row = targets[0].sequence, targets[0].row
-    rate, smoothness = descent.scene.settings.rates.frame, descent.scene.settings.pass_smoothness
+    smoothness = descent.scene.settings.pass_smoothness
     stepper = descent.stepper(sequence, row, smoothness)
     weights, even, around = descent.trusted(), list(targets), expected_around(descent, sequence, row)
     for step in range(steps):
         moving, leaves = descent.moving(targets[0], ("row",))
-        if step % _LIGHT_EVERY == 0:
+        if step % 10 == 0:  # number of a frame's steps between estimates of the unexplained light in its pictures
             even = [without_smooth_difference(descent.scene, target, moving, weights) for target in targets]
         loss = descent.frame_cost(even, moving, weights, around, smoothness)
         (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-        stepper.step(gradient, rate * _fading(step, steps))
+        stepper.step(gradient, RATES["row"] * _fading(step, steps))
 
 
 def expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, "t p"]:
@@ -192,7 +276,7 @@ def expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, 
     With the past alone, heads drifted by degrees.
     """
     rows, start = descent.state.frames[sequence], descent.start[sequence]
-    return torch.cat([rows[: row + 1], descent.within(rows[row] + start[row + 1 :] - start[row])])
+    return torch.cat([rows[: row + 1], descent.bounds.clip(rows[row] + start[row + 1 :] - start[row])])
 
 
 def _learn_texture(descent: Descent, target: Target) -> None:
@@ -202,13 +286,13 @@ def _learn_texture(descent: Descent, target: Target) -> None:
         visibility = visibility_of(scene, target, descent.moving(target, ())[0])
         better = (visibility > state.visibility + _TEXTURE_GAIN) & (visibility > _TEXTURE_LEAST_COSINE)
     if target.row > 0 and better.any():
-        moments, steps = Moments.zeros(state.texture), scene.settings.texture_steps
+        moments, steps = Moments.zeros(state.texture), 8
         for step in range(steps):
             moving, leaves = descent.moving(target, ("texture",))
-            vertices, _ = pose_vertices(scene, moving)
+            vertices = pose_vertices(scene, moving)
             loss = color_term(scene, target, moving, vertices, scene.used * better)
             (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-            apply_adam(moments, state.texture, gradient, 3 * scene.settings.rates.texture * _fading(step, steps))
+            apply_adam(moments, state.texture, gradient, 3 * RATES["texture"] * _fading(step, steps))
     seen = visibility > _TEXTURE_LEAST_COSINE
     state.visibility = torch.where(better | (seen & (state.visibility == 0)), visibility, state.visibility)
 

@@ -13,20 +13,18 @@ from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.machine.progress import say
-from mien.tracking.descent.schedule import fit_by_descent
-from mien.tracking.fitting.fit import Fit, Watch, ignore_progress
+from mien.tracking.descent.fit import fit_by_descent
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.resume import StageCache
-from mien.tracking.fitting.shot import Shot, explaining_singular, lenses_of, shot_of
-from mien.tracking.held_out import Stages, follow_held_out
-from mien.tracking.landmarks.detector_response import DetectorResponse, read_response
+from mien.tracking.fitting.sequence import SequenceData, explaining_singular, sequence_data
+from mien.tracking.landmarks.detector_response import read_response
 from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
-from mien.tracking.landmarks.outcome import as_tracking
+from mien.tracking.landmarks.outcome import as_tracking, without_turn_habits
+from mien.tracking.landmarks.problem import Problem, lenses_of
 from mien.tracking.landmarks.stages import fit_landmarks
-from mien.tracking.landmarks.term import all_landmarks
-from mien.tracking.landmarks.turn_habits import without_turn_habits
+from mien.tracking.pipeline.held_out import StageFits, follow_held_out
 from mien.tracking.pixels.outcome import with_pixels
-from mien.tracking.pixels.refine import refine_photometrically
+from mien.tracking.pixels.refine import photometric_start, refine_photometrically
 from mien.tracking.report.preview import DONE, Preview
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
@@ -68,16 +66,11 @@ def track_subject(
         keep: A folder of its own for finished pieces, which is removed at the end. Interrupted tracking of the same
             captures with the same settings resumes from it and gives the same numbers. If its pieces do not fit,
             tracking starts again.
-        preview: An .html file (with a .png beside it) that shows the state of the fit. It is written again every few
-            seconds.
+        preview: An .html file that shows the state of the fit. It is written again every few seconds.
         held_out: Further sequences of the person, which are tracked apart.
 
     Returns:
         The trackings of `captures`, then those of `held_out`.
-
-    Raises:
-        UserError: A capture has several cameras without calibration, too few timesteps with a face, or landmarks that
-            no face could have; or the model lacks the landmarks.
     """
     assert captures, "nothing to track"
     settings.check()
@@ -103,73 +96,61 @@ def track_once(
     """Track as `track_subject` does, but without a second try if stored pieces cannot be used."""
     if "mediapipe" not in face_model.landmarks:
         raise UserError(f"face model {face_model.name!r}: has no MediaPipe landmarks; place them on it first")
-    shots, cache = [shot_of(capture, settings) for capture in captures], StageCache(keep)
-    others = [shot_of(capture, settings) for capture in held_out]
+    data, cache = [sequence_data(capture, settings) for capture in captures], StageCache(keep)
+    apart = [sequence_data(capture, settings) for capture in held_out]
     with torch.no_grad():
-        layout = layout_of(face_model)
-        model = reduce_face_model(face_model, layout, _response(face_model, shots, settings))
-        watch = ignore_progress if preview is None else Preview(preview, face_model, model, shots, settings)
-        found = _fit(model, shots, lenses_of(captures, settings), settings, cache, watch)
-        trackings = _trackings(face_model, model, shots, found, settings, ignore_progress if others else watch)
-        if others:
-            both = reduce_face_model(face_model, layout, _response(face_model, [*shots, *others], settings))
-            watch = ignore_progress if preview is None else Preview(preview, face_model, both, others, settings)
-            apart = StageCache(None if keep is None else keep / "held_out", resumed=cache.resumed)
-            followed = follow_held_out(both, others, shots, found, settings, apart, watch)
-            trackings += _trackings(face_model, both, others, followed, settings, watch)
+        model = _landmark_model(face_model, data, settings)
+        problem = Problem(model, data, lenses_of(captures, settings), settings, cache)
+        problem = replace(problem, callback=preview and Preview(preview, face_model, problem))
+        fits = _fit(problem)
+        trackings = _trackings(face_model, replace(problem, callback=None) if apart else problem, fits)
+        if apart:
+            model = _landmark_model(face_model, [*data, *apart], settings)
+            pieces = StageCache(None if keep is None else keep / "held_out", resumed=cache.resumed)
+            motion = Problem(model, apart, [None] * len(apart), settings, pieces)
+            motion = replace(motion, callback=preview and Preview(preview, face_model, motion))
+            trackings += _trackings(face_model, motion, follow_held_out(motion, data, fits))
     cache.forget()
     return trackings
 
 
-def _fit(
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    lenses: Sequence[int | None],
-    settings: TrackingSettings,
-    cache: StageCache,
-    watch: Watch,
-) -> Stages:
+def _landmark_model(
+    face_model: FaceModel, sequences: Sequence[SequenceData], settings: TrackingSettings
+) -> LandmarkModel:
+    """The face model's landmarks as the detector sees them."""
+    # Sequences of one subject are captured alike. If they are not, the first decides.
+    response = read_response(face_model, settings.bias_sigma, detector_of(sequences[0].capture.source))
+    if any(len(data.cameras) > 1 for data in sequences):
+        # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
+        response = response.without_turns()
+    return reduce_face_model(face_model, layout_of(face_model), response)
+
+
+def _fit(problem: Problem) -> StageFits:
     """Run the stages of the schedule."""
-    with explaining_singular(shots):
-        landmarks = fit_landmarks(model, shots, lenses, settings, cache, watch)
+    settings = problem.settings
+    with explaining_singular(problem.data):
+        landmarks = fit_landmarks(problem)
     pixels, descent = None, None
     if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
-        pixels = refine_photometrically(model, shots, lenses, landmarks, settings, cache, watch)
+        pixels = refine_photometrically(problem, photometric_start(problem, landmarks))
     if settings.schedule == "paper":
-        start = landmarks if pixels is None else pixels.fit
-        descent = fit_by_descent(model, shots, lenses, start, settings, cache, watch, pixels)
-    return Stages(landmarks, pixels, descent)
+        descent = fit_by_descent(problem, landmarks if pixels is None else pixels.fit, pixels)
+    return StageFits(landmarks, pixels, descent)
 
 
-def _trackings(
-    face_model: FaceModel,
-    model: LandmarkModel,
-    shots: Sequence[Shot],
-    found: Stages,
-    settings: TrackingSettings,
-    watch: Watch,
-) -> list[Tracking]:
-    """The results as trackings, after the last correction. The watch receives the end."""
-    fit = _without_turn_habits(model, shots, found.fit, settings)
-    refined = None if found.refined is None else replace(found.refined, fit=fit)
-    watch(DONE, 1.0, lambda: refined or fit)
+def _trackings(face_model: FaceModel, problem: Problem, fits: StageFits) -> list[Tracking]:
+    """The results as trackings, after the last correction. The callback receives the end."""
+    parts = zip(problem.landmark_terms(fits.fit), fits.fit.sequences, strict=True)
+    calm = [without_turn_habits(term, fits.fit.subject, sequence) for term, sequence in parts]
+    fit = replace(fits.fit, sequences=tuple(calm))
+    refined = None if fits.refined is None else replace(fits.refined, fit=fit)
+    if problem.callback is not None:
+        problem.callback(DONE, 1.0, lambda: refined or fit)
     trackings = [
-        as_tracking(shot, face_model, model, fit.subject, own, settings)
-        for shot, own in zip(shots, fit.sequences, strict=True)
+        as_tracking(problem, face_model, data, fit.subject, sequence)
+        for data, sequence in zip(problem.data, fit.sequences, strict=True)
     ]
     if refined is not None and (refined.texture.trust > 0).any():
-        trackings = with_pixels(trackings, shots, refined, face_model, settings)
+        trackings = with_pixels(trackings, problem.data, refined, face_model)
     return trackings
-
-
-def _without_turn_habits(model: LandmarkModel, shots: Sequence[Shot], fit: Fit, settings: TrackingSettings) -> Fit:
-    calm = [without_turn_habits(all_landmarks(model, shot.views, own, settings), fit.subject, own)
-            for shot, own in zip(shots, fit.sequences, strict=True)]  # fmt: skip
-    return replace(fit, sequences=tuple(calm))
-
-
-def _response(face_model: FaceModel, shots: Sequence[Shot], settings: TrackingSettings) -> DetectorResponse:
-    # Sequences of one subject are captured alike. If they are not, the first decides.
-    response = read_response(face_model, settings.bias_sigma, detector_of(shots[0].capture.source))
-    # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
-    return response if all(len(shot.cameras) == 1 for shot in shots) else response.without_turns()

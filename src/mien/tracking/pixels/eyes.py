@@ -15,7 +15,6 @@ from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_LID_PAIRS, RIGHT_E
 
 _LIDS_REACH = 1.3  # distance from an eyeball's centre that contains its lids, in radii. Set by eye on the face models
 _AROUND_REACH = 3.5  # distance from an eyeball's centre that contains everything that may hide it, in radii. Set by eye
-_CLOSING_STEPS = 64  # number of equal steps of a coefficient
 _MOST_CLOSING = 1.25  # a coefficient closes an eye if the lids meet within this multiple of its upper bound
 _OTHERS_SHARE = 0.2  # a coefficient is not an eye's own if it moves the other eye's lids by more than this share
 
@@ -53,8 +52,7 @@ def eyes_of(model: FaceModel, layout: ParameterLayout) -> list[Eye]:
     ball = model.region_mask("eyes", "irises")
     if not ball.any() or len(layout.expression_index) == 0:
         return []
-    pairs = (RIGHT_LID_PAIRS, LEFT_LID_PAIRS)
-    closing = torch.stack([_closing(model, layout, pair) for pair in pairs])
+    closing = [_closing(model, layout, pairs) for pairs in (RIGHT_LID_PAIRS, LEFT_LID_PAIRS)]
     marks = model.landmark_positions(model.template, "mediapipe")
     middles = torch.stack([marks[list(lids)].mean(0) for lids in (RIGHT_EYELIDS, LEFT_EYELIDS)])
     centers = model.template[model.faces].mean(1)
@@ -144,7 +142,4 @@ def _where_lids_touch(
         seen = rasterize_mesh(rest + amount * motion, eye.moving, camera).face_index
         return int(((seen >= 0) & (seen < eye.ball)).sum())
 
-    steps = _CLOSING_STEPS
-    amounts = [eye.closed * step / steps for step in range(steps + 1)]
-    areas = [left(amount) for amount in amounts]
-    return amounts[areas.index(min(areas))]
+    return min((eye.closed * step / 64 for step in range(65)), key=left)

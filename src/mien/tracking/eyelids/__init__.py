@@ -1,1 +1,0 @@
-"""Eyelids, placed from the colours of each eye."""
