@@ -32,7 +32,7 @@ from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import read_tracking
 from mien.training import TrainSettings, train
 from mien.training.alignment import FaceDescent, align, align_faces, steadier
-from mien.training.alignment_settings import AlignmentSettings
+from mien.training.settings import AlignmentSettings
 from refusals import complaint, refuses
 from shared_things import write_sequence, write_toy_workspace
 from small_face_model import make_small_face_model

@@ -21,13 +21,13 @@ from mien.render.rendering import Rendering
 from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces
-from mien.training.alignment_settings import AlignmentSettings
 from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
 from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.footage.sequence import Sequence, Targets, composite
 from mien.training.frame_gains import FrameGains, frame_gains_part, lit, read_gains
+from mien.training.settings import AlignmentSettings
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
 from refusals import refuses

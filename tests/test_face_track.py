@@ -10,7 +10,7 @@ from mien.avatar.schedules import Progress, Rate
 from mien.avatar.settings import FaceTuning
 from mien.face import FaceParams
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns
+from mien.training.footage.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns
 from mien.training.trainer import ALIGNED_TUNING, tuning_for
 from toy_scene import toy_face, toy_sequence
 

@@ -13,7 +13,6 @@ from mien.avatar.avatar import neutral_of
 from mien.avatar.baking import make_portable
 from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import (
-    SHIFT_LENGTH,
     HeadGas,
     input_directions,
     neighbor_distances,
@@ -21,7 +20,7 @@ from mien.avatar.headgas.avatar import (
     spread_out,
 )
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
-from mien.avatar.headgas.variants import MOVED, averaging_weights
+from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import PerceptualLoss, Photometric

@@ -20,8 +20,13 @@ from mien.tracking import write_tracking
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import training_frames
 from mien.training.settings import doubly_held_out
-from mien.training.splits.benchmark import with_benchmark_split
-from mien.training.splits.named import SEQUENCES, driving_sequences, split_by_name, with_named_split
+from mien.training.settings.splits import (
+    SEQUENCES,
+    driving_sequences,
+    split_by_name,
+    with_benchmark_split,
+    with_named_split,
+)
 from refusals import refuses
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 

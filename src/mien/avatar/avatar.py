@@ -57,6 +57,8 @@ class ParameterGroup:
     """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
     halvings: tuple[float, ...] = ()
     """Times at which the rate is halved, as fractions of the run."""
+    begin: float = 0.0
+    """Time up to which the rate is 0, as a fraction of the run."""
     epsilon: float = EPSILON
     """Adam's epsilon. It does not reach gradients that are `factored`."""
     factored_moments: type[Moments] | type[FactoredMoments] = FactoredMoments
@@ -64,6 +66,8 @@ class ParameterGroup:
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
+        if progress.fraction < self.begin:
+            return 0.0
         halved = 0.5 ** sum(progress.fraction >= time for time in self.halvings)
         return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0) * halved
 

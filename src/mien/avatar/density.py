@@ -5,7 +5,7 @@ these descriptions, never the method.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -60,14 +60,6 @@ class GradientDensity:
     may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]] | None = None
     """(store) -> Gaussians whose opacity resets lower. None if they all are."""
 
-    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "GradientDensity":
-        """The same control with `may_reset`, and with a limit that is higher by `extra` Gaussians."""
-        return replace(
-            self,
-            settings=replace(self.settings, max_gaussians=self.settings.max_gaussians + extra),
-            may_reset=may_reset,
-        )
-
 
 def drawn_opacities(gaussians: Gaussians, rendering: Rendering) -> Float[Tensor, " n"]:
     """The hook of methods whose Gaussians are visible by their opacity."""
@@ -90,18 +82,10 @@ class RefillDensity:
     """(Gaussians of a step, their picture after the backward pass) -> how visible each Gaussian is, 0..1. The highest
     value since the last round stands for the opacity."""
 
-    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "RefillDensity":
-        """The same control, which resets no opacity and has no limit."""
-        return self
-
 
 @dataclass(frozen=True)
 class FixedDensity:
     """The number of Gaussians never changes."""
-
-    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "FixedDensity":
-        """The same control, which resets no opacity and has no limit."""
-        return self
 
 
 DensityControl = GradientDensity | RefillDensity | FixedDensity

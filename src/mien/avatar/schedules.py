@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
-from mien.disk.config import FRACTION, Range
+from mien.disk.config import Range
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,18 @@ class Progress:
         """0 at the first step, 1 after the last."""
         return self.step / self.steps
 
+    @property
+    def done(self) -> int:
+        """Number of steps after this one."""
+        return self.step + self.frames
+
+    def reaches(self, every: int) -> bool:
+        """Whether a multiple of a number of steps is done after this step, and was not before it."""
+        return self.done // every > self.step // every
+
     def completes(self, steps: Iterable[int]) -> bool:
         """Whether one of these numbers of steps is done after this step, and was not before it."""
-        return any(self.step < count <= self.step + self.frames for count in steps)
+        return any(self.step < count <= self.done for count in steps)
 
 
 def active_degree(degree: int, warmup: float, progress: Progress) -> int:
@@ -48,21 +57,13 @@ class Rate:
     """A learning rate over the run: constant, or log-linear from `start` to `end`."""
 
     start: Annotated[float, Range(0, 100)]
-    """The rate at the first step, or at `begin`. With 0, nothing is learned, whatever `end` is."""
+    """The rate at the first step. With 0, nothing is learned, whatever `end` is."""
     end: Annotated[float | None, Range(1e-12, 100)] = None
     """The rate at the last step. If it is not given, the rate is constant."""
-    begin: Annotated[float, FRACTION] = 0.0
-    """The fraction of the run up to which the rate is 0."""
-
-    def scaled(self, share: float) -> "Rate":
-        """A share of this rate at all times."""
-        return replace(self, start=share * self.start, end=None if self.end is None else share * self.end)
 
     def at(self, progress: Progress) -> float:
         """The rate at a step."""
-        if progress.fraction < self.begin:
-            return 0.0
         if self.end is None or self.start == 0:
             return self.start
-        along = (progress.fraction - self.begin) / max(1 - self.begin, 1e-9)
+        along = progress.fraction
         return math.exp((1 - along) * math.log(self.start) + along * math.log(self.end))

@@ -6,13 +6,14 @@ Every number has its range beside it (`mien.disk.config`), and every field a des
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypedDict, final
 
-from mien.avatar.schedules import Rate
 from mien.disk.config import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
 
 GAUSSIAN_COUNT = Range(1, 10_000_000)
 """Range of a number of Gaussians. Tens of millions would not fit into memory."""
 EPSILON_RANGE = Range(1e-30, 1)
 """Range of Adam's epsilon."""
+RATE = Range(0, 100)
+"""Range of a learning rate."""
 
 
 class Differences(TypedDict, total=False):
@@ -99,14 +100,16 @@ class FaceTuning:
     enabled: bool = True
     """Whether training corrects the tracking. Held-out frames get corrections interpolated from the training frames
     around them."""
-    expression: Rate = Rate(1e-3)
+    expression: Annotated[float, RATE] = 1e-3
     """Learning rate of the expression coefficients, per step."""
-    joints: Rate = Rate(1e-3)
+    joints: Annotated[float, RATE] = 1e-3
     """Learning rate of the free joints' angles, in radians per step."""
-    head_rotation: Rate = Rate(1e-3)
+    head_rotation: Annotated[float, RATE] = 1e-3
     """Learning rate of the head's rotation, in radians per step."""
-    head_translation: Rate = Rate(3e-4)
+    head_translation: Annotated[float, RATE] = 3e-4
     """Learning rate of the head's position, in metres per step."""
+    begin: Annotated[float, FRACTION] = 0.0
+    """Time up to which faces do not change, as a fraction of the run."""
     keep_mean_pose: bool = False
     """Whether the corrections of the head's pose have a mean of zero, in the head's own frame. With one camera, heads
     and Gaussians otherwise move away from the camera together, which shows from the side."""
@@ -121,29 +124,16 @@ class FaceTuning:
     def slowed(self, share: float) -> "FaceTuning":
         """These settings with a share of all learning rates."""
         names = ("expression", "joints", "head_rotation", "head_translation")
-        return replace(self, **{name: getattr(self, name).scaled(share) for name in names})
+        return replace(self, **{name: share * getattr(self, name) for name in names})
 
 
-@dataclass(frozen=True)
-class DensityRules:
-    """A switch for each rule of gradient-based density control. Each says what happens while it is on."""
-
-    clone: bool = True
-    """Small Gaussians with strong gradients are duplicated."""
-    split: bool = True
-    """Large Gaussians with strong gradients are split in two."""
-    prune_faint: bool = True
-    """Gaussians below `prune_opacity` are removed."""
-    prune_large: bool = True
-    """Gaussians above `prune_size` are removed."""
-    prune_wide: bool = True
-    """Gaussians above `prune_radius` on screen are removed. A `prune_radius` of 0 removes none."""
-    reset_opacities: bool = True
-    """Opacities are lowered at `opacity_resets`. The first of these times still sets when pruning by size begins."""
-    never_empty: bool = True
-    """Gaussians that the method protects are not removed (GaussianAvatars: the last one of each triangle)."""
-    cap: bool = True
-    """Growth stops at `max_gaussians`."""
+DensityRule = Literal[
+    "clone", "split", "prune_faint", "prune_large", "prune_wide", "reset_opacities", "never_empty", "cap"
+]
+"""A rule of gradient-based density control: duplicate small and split large Gaussians; remove faint ones, large ones
+(`prune_size`) and those that are wide on screen (`prune_radius`); lower opacities (the first of `opacity_resets` still
+sets when pruning by size begins); keep what the method protects (GaussianAvatars: the last one of each triangle); stop
+at `max_gaussians`."""
 
 
 @dataclass(frozen=True)
@@ -166,8 +156,6 @@ class GradientSettings:
     """Unit of `split_size` and `prune_size`: metres, or the extent of the training cameras (docs/paper_preset.md)."""
     split_size: Annotated[float, NOT_NEGATIVE] = 0.0025
     """Gaussians that grow are split in two if they are larger than this, in `size_unit`, and duplicated otherwise."""
-    prune_opacity: Annotated[float, FRACTION] = 0.005
-    """Gaussians below this opacity are removed."""
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
     """Gaussians larger than this, in `size_unit`, are removed. This begins with the first opacity reset after
     `start`, or at `size_start`."""
@@ -178,14 +166,12 @@ class GradientSettings:
     """Time after which Gaussians are removed by their size, as a fraction of the run. If it is not given, this begins
     with the first opacity reset after `start`."""
     opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
-    """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
-    reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01
-    """Highest opacity that remains after a reset."""
+    """Times at which opacities are lowered, as fractions of the run."""
     max_gaussians: Annotated[int, GAUSSIAN_COUNT] = 40_000
     """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first. Fills of sides
     that no picture shows do not count."""
-    rules: DensityRules = field(default_factory=DensityRules)
-    """A switch for each rule."""
+    rules_off: tuple[DensityRule, ...] = ()
+    """Rules that are switched off (docs/settings.md)."""
 
 
 @dataclass(frozen=True)

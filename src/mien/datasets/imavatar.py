@@ -202,7 +202,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
 
 def _with_split(sequence: Any, held: dict[str, tuple[tuple[int, int], ...]]) -> ReadSequence:
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
     return replace(sequence, own_split=OwnSplit(held[sequence.capture.name]) if held else None)
 

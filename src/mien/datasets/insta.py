@@ -219,7 +219,7 @@ def _pictures(layout: _Layout, size: tuple[int, int]) -> "tuple[np.ndarray, np.n
 
 
 def _with_split(sequence: ReadSequence, layout: _Layout) -> ReadSequence:
-    from mien.training.splits.own import OwnSplit, ranges_of
+    from mien.training.settings.splits import OwnSplit, ranges_of
 
     return replace(sequence, own_split=OwnSplit(ranges_of(list(layout.test)))) if layout.test else sequence
 

@@ -126,7 +126,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.matting import fill_mattes
     from mien.datasets.pictures import collect, read_picture
     from mien.datasets.sequences import filmed_sequence
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
     for name, given in _clips(path).items():
         file, frames = _file(path, name), _in_time(path, given) if name == "train" else given

@@ -14,7 +14,7 @@ from mien.evaluation.experiment import Experiment, target_image
 from mien.face.params import FaceParams
 from mien.render import rasterize
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack
+from mien.training.footage.face_track import FaceTrack
 from mien.training.footage.frames import Frame
 from mien.training.photometric import photometric_loss
 

@@ -16,7 +16,7 @@ from mien.evaluation.report.compare_report import write_comparison
 from mien.evaluation.report.text import dataset_line, driven_line, protocol_lines
 from mien.machine.progress import say
 from mien.training.run import read_run_config
-from mien.training.splits.named import DRIVING, NAMED_SPLIT, driving_sequences
+from mien.training.settings.splits import DRIVING, NAMED_SPLIT, driving_sequences
 
 
 def run_evaluation_stage(

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar, ParameterGroup, frozen, move_avatar
 from mien.avatar.methods import DEFAULT_METHOD
-from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning
 from mien.avatar.store import Moments
 from mien.disk.config import overlay
@@ -29,14 +28,13 @@ from mien.face.params import FaceParams, concatenate
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
+from mien.training.footage.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage.frames import Frame, evenly_spread, training_frames
 from mien.training.footage.sequence import Sequence, Target, Targets
 from mien.training.frame_gains import lit, read_gains
 from mien.training.photometric import photometric_loss
 from mien.training.run import read_face_track
-from mien.training.settings import PRESETS, TrainSettings
+from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 from mien.training.trainer import ProgressBar, train
 
 ALIGNED_TOGETHER = 4  # number of timesteps that are aligned in one pass
@@ -247,7 +245,7 @@ def _values(track: FaceTrack, index: int) -> dict[str, Tensor]:
 def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
     """How far a step moves each field."""
     rates = (_ALIGNED_EXPRESSION, _ALIGNED_JOINTS, 1.0, _ALIGNED_SHIFT)
-    own = [Rate(settings.rate).scaled(share) for share in rates]
+    own = [share * settings.rate for share in rates]
     return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
 
 

@@ -22,10 +22,9 @@ from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
 from mien.training.ahead import Result, TargetQueue
 from mien.training.checkpoint import TrainingState
-from mien.training.footage.frames import LEAST_EXTENT, Frame, FrameOrder, background_at, crop_random
+from mien.training.footage.frames import CROP, LEAST_EXTENT, BatchFrame, Frame, FrameOrder, background_at, random_at
 from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
-from mien.training.parts import BatchFrame
 from mien.training.settings import TrainSettings
 
 LEAST_HALVED = 384  # least longer side of pictures that are halved at the start of a run, in pixels
@@ -69,7 +68,7 @@ class TrainingData:
         self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings
     ) -> Callable[[], PerceptualGoal]:
         """A function that returns the goal of a step's perceptual loss. With `ahead`, it is made meanwhile."""
-        make = partial(perceptual_goal, target, perceptual, crop_random(settings, step))
+        make = partial(perceptual_goal, target, perceptual, random_at(settings.seed, CROP, step))
         return self.meanwhile(make) if target.background.device.type == "cpu" else make
 
     def meanwhile(self, make: Callable[[], Result]) -> Callable[[], Result]:
@@ -93,7 +92,7 @@ def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings
         goal = data.goal(target, perceptual, number, settings) if due else None
         camera = data.targets_at(number)[frame.sequence].camera(frame.camera)
         index = state.track.index_of(frame.sequence, frame.timestep)
-        batch.append(BatchFrame(number, frame, index, camera, target, goal))
+        batch.append(BatchFrame(number, frame, index, state.track.face(index), camera, target, goal))
     return batch
 
 
@@ -101,11 +100,11 @@ def draw(
     state: TrainingState, batch: Items[BatchFrame], progress: Progress
 ) -> tuple[Posed, list[Posed], list[Rendering]]:
     """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
-    faces = [state.track.face(one.index) for one in batch]
+    faces = [one.face for one in batch]
     posed = state.avatar.pose(faces[0] if len(faces) == 1 else concatenate(faces), progress)
     each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
-    for part in state.parts:
-        each = [part.posed(own, one) for one, own in zip(batch, each, strict=True)]
+    if state.head is not None:
+        each = [state.head.posed(own, one) for one, own in zip(batch, each, strict=True)]
     views = [(own.gaussians.timestep(0), one.camera) for one, own in zip(batch, each, strict=True)]
     backgrounds = [one.target.background for one in batch]
     whole = each[0] if len(batch) == 1 else posed
@@ -117,17 +116,15 @@ def draw(
 def seen(state: TrainingState, batch: Items[BatchFrame], renderings: Items[Rendering]) -> list[Rendering]:
     """The pictures as they are compared, for example in the colours of their cameras."""
     shown = list(renderings)
-    for part in state.parts:
-        shown = [part.seen(rendering, one) for one, rendering in zip(batch, shown, strict=True)]
+    for own in state.colors:
+        shown = [own.seen_by(image, one.target.background, one.frame) for one, image in zip(batch, shown, strict=True)]
     return shown
 
 
 def compare(state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]) -> dict[str, Float[Tensor, ""]]:
     """The losses that compare pictures, by name: means over the frames."""
-    weights = state.avatar.config.photometric
-    for part in state.parts:
-        weights = part.weights(weights)
-    weights = weights.scaled(1 / len(batch))
+    own = state.avatar.config.photometric
+    weights = (own if state.head is None else state.head.weights(own)).scaled(1 / len(batch))
     return _summed(picture_losses(image, one.target, weights) for one, image in zip(batch, shown, strict=True))
 
 

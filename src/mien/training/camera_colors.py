@@ -17,30 +17,28 @@ from mien.errors import UserError
 from mien.render.rendering import Rendering
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
-from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
 
-_CAMERA_COLORS_LAST_RATE = 0.1
-"""Learning rate of the cameras' colours, and of gains, at the last step, as a share of that at the first."""
+COLOR_RATE = 1e-3  # learning rate of the cameras' colours, and of gains, at the first step
+_LAST_SHARE = 0.1  # the same at the last step, as a share of that at the first
 
 
 class LearnedColors:
     """Numbers of colours that are learned beside the avatar, with their own state of the optimiser.
 
     Args:
-        name: Name of their parameter group.
+        name: Name of their parameter group, and prefix of their tensors in checkpoints.
         values: The numbers before the first step.
-        rate: Learning rate at the first step.
     """
 
-    def __init__(self, name: str, values: Tensor, rate: float):
+    def __init__(self, name: str, values: Tensor):
         self.values = values.detach().clone().requires_grad_()
-        self._name, self._rate = name, Rate(rate, _CAMERA_COLORS_LAST_RATE * rate)
+        self.name, self._rate = name, Rate(COLOR_RATE, _LAST_SHARE * COLOR_RATE)
         self._moments = {"changes": Moments.zeros(values)}
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group of all numbers."""
-        return [ParameterGroup(self._name, {"changes": self.values}, self._rate, {**self._moments})]
+        return [ParameterGroup(self.name, {"changes": self.values}, self._rate, {**self._moments})]
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a checkpoint has to save. They share memory with the numbers."""
@@ -87,7 +85,7 @@ class CameraColors:
         self._first_is_right = settings.camera_colors == "first"
         self.ids = tuple(ids)
         """The cameras, in the order of the maps."""
-        self.learned = LearnedColors("camera_colors", like.new_zeros(len(ids), 3, 4), settings.camera_color_rate)
+        self.learned = LearnedColors("colors", like.new_zeros(len(ids), 3, 4))
         places = {camera_id: place for place, camera_id in enumerate(ids)}
         self._places = [[places.get(camera_id, 0) for camera_id in one.capture.camera_ids] for one in sequences]
 
@@ -106,19 +104,3 @@ def camera_colors(
 ) -> CameraColors | None:
     """The colour transforms of a run, or None if its settings ask for none."""
     return None if settings.camera_colors == "none" else CameraColors(sequences, frames, settings, like)
-
-
-def camera_colors_part(
-    sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
-) -> TrainingPart | None:
-    """`camera_colors` as a part of a training."""
-    colors = camera_colors(sequences, frames, settings, like)
-    if colors is None:
-        return None
-    return TrainingPart(
-        "colors",
-        seen=lambda rendering, one: colors.seen_by(rendering, one.target.background, one.frame),
-        parameter_groups=colors.learned.parameter_groups,
-        state=colors.learned.state,
-        load_state=colors.learned.load_state,
-    )

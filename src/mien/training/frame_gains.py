@@ -17,21 +17,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.capture.quality import is_light_changing
-from mien.disk.files import read_tensors
-from mien.errors import UserError
+from mien.disk.files import expect_whole, read_tensors
 from mien.render.rendering import Rendering
 from mien.training.camera_colors import LearnedColors, recolored
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
-from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
 
 _GAIN_INTERVAL = 0.1  # time in seconds between knots of the gains of timesteps. Automatic exposure takes longer
 
 GAINS = "gains.safetensors"
 """File of a run with the gains of all timesteps of all sequences. Runs in steady light have none."""
-_MOST = 100.0
-"""Largest gain that is read, and the inverse of the least."""
 
 
 class FrameGains:
@@ -43,11 +39,10 @@ class FrameGains:
     Args:
         sequences: The sequences of a run.
         frames: The frames that are trained on.
-        rate: Learning rate of the logarithms, per step.
         like: The gains have its dtype and its device.
     """
 
-    def __init__(self, sequences: Items[Sequence], frames: Items[Frame], rate: float, like: Tensor):
+    def __init__(self, sequences: Items[Sequence], frames: Items[Frame], like: Tensor):
         lengths = [sequence.capture.timesteps for sequence in sequences]
         self._starts = [sum(lengths[:index]) for index in range(len(lengths))]
         used = [sorted({one.timestep for one in frames if one.sequence == index}) for index in range(len(lengths))]
@@ -72,7 +67,7 @@ class FrameGains:
         self._places, self._shares = torch.from_numpy(places).to(like.device), torch.from_numpy(shares).to(like)
         self._usual = torch.from_numpy(usual).to(like)
         self._trained = torch.from_numpy(shares.sum(1, keepdims=True)).to(like)
-        self.learned = LearnedColors("frame_gains", knots[:, None].repeat(1, 3), rate)
+        self.learned = LearnedColors("gains", knots[:, None].repeat(1, 3))
 
     def _at(self, index: int | slice) -> Float[Tensor, "n 3"]:
         """The logarithms of the gains of some timesteps."""
@@ -105,21 +100,13 @@ def light_changes(sequences: Items[Sequence], frames: Items[Frame]) -> bool:
     return is_light_changing(levels)
 
 
-def frame_gains_part(
+def frame_gains(
     sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
-) -> TrainingPart | None:
-    """The gains of a run as a part of its training, or None if the light is steady or the settings ask for none."""
+) -> FrameGains | None:
+    """The gains of a run, or None if the light is steady or the settings ask for none."""
     if settings.light == "steady" or (settings.light == "auto" and not light_changes(sequences, frames)):
         return None
-    gains = FrameGains(sequences, frames, settings.camera_color_rate, like)
-    return TrainingPart(
-        "gains",
-        seen=lambda rendering, one: gains.seen_by(rendering, one.target.background, one.frame),
-        parameter_groups=gains.learned.parameter_groups,
-        state=gains.learned.state,
-        load_state=gains.learned.load_state,
-        results=lambda: {GAINS: {"gains": gains.gains().detach()}},
-    )
+    return FrameGains(sequences, frames, like)
 
 
 def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]:
@@ -132,11 +119,8 @@ def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]
     path = run_dir / GAINS
     if not path.exists() and not path.is_symlink():
         return []
-    gains = read_tensors(path).get("gains", torch.zeros(0))
-    is_whole = gains.shape == (sum(lengths), 3) and gains.dtype in (torch.float32, torch.float64)
-    if not is_whole or not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
-        raise UserError(f"{path}: does not hold gains of {sum(lengths)} timesteps; train again")
-    return list(gains.float().split(list(lengths)))
+    with expect_whole(path, "train again"):
+        return list(read_tensors(path)["gains"].float().split(list(lengths)))
 
 
 def _brightness(sequences: Items[Sequence], frames: Items[Frame], timesteps: int) -> Float[np.ndarray, " t"]:

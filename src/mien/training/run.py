@@ -35,6 +35,7 @@ from mien.training.checkpoint import CURVES, TrainingState
 from mien.training.footage.coverage import Coverage
 from mien.training.footage.filmed import write_coverage
 from mien.training.footage.sequence import Sequence
+from mien.training.frame_gains import GAINS
 from mien.training.settings import PRESETS, TrainSettings
 
 _FORMAT, _VERSION = "mien.run", 1
@@ -52,7 +53,7 @@ _MAX_SUMMARY = 1 << 62
 _MAX_CURVE_NUMBER = 1e12
 """Largest number in a curve that is read. Real ones stay far below, and plots cannot divide their range beyond it."""
 _OTHER_NAME = "give this run another name (--run NAME) or delete it"
-_FREE_TO_CHANGE = ("threads", "device", "checkpoint_every")
+_FREE_TO_CHANGE = ("device", "checkpoint_every")
 """Settings that say how a run is computed, not what it computes. They may change when the run continues."""
 
 
@@ -215,9 +216,8 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
     """Write everything that is kept after training. training.json is last and marks the run as finished."""
     write_avatar(run_dir / "avatar", state.avatar)
     write_tensors(run_dir / _TRACK, state.track.params().tensors())
-    for part in state.parts:
-        for name, tensors in part.results().items():
-            write_tensors(run_dir / name, tensors)
+    if state.gains is not None:
+        write_tensors(run_dir / GAINS, {"gains": state.gains.gains().detach()})
     write_coverage(run_dir, covered)
     curves = {name: torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
     write_tensors(run_dir / "curves.safetensors", curves)

@@ -14,6 +14,7 @@ _FEATURES = ("feature_color", "feature_opacity")
 """Names of the changes by features."""
 BASES = ("color_basis", "opacity_basis", "offset_basis")
 """Names of the bases of linear changes, which are also those of the changes."""
+APPEARANCE_WEIGHT = 0.1  # weight of the mean squared changes of colour and opacity by features
 
 
 def change_penalties(config: GaussianAvatarsConfig, changes: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
@@ -23,7 +24,7 @@ def change_penalties(config: GaussianAvatarsConfig, changes: Mapping[str, Tensor
         config: The settings, which have the weights.
         changes: The changes of one or more timesteps by name; others are ignored.
     """
-    kinds = (("expression", BASES, config.expression_weight), ("appearance", _FEATURES, config.appearance_weight))
+    kinds = (("expression", BASES, config.expression_weight), ("appearance", _FEATURES, APPEARANCE_WEIGHT))
     losses = {}
     for loss, names, weight in kinds:
         chosen = [changes[name] for name in names if name in changes]

@@ -18,8 +18,10 @@ from mien.avatar.schedules import Rate
 from mien.avatar.store import GaussianStore
 from mien.runtime.baked import FeatureChanges
 
-_OUTPUTS = 4
-"""Outputs of the network: three changes of colour, and one of opacity."""
+_OUTPUTS = 4  # three changes of colour, and one of opacity
+_HIDDEN = 32  # width of the only hidden layer
+_RATE = Rate(2.5e-3)  # learning rate of the features
+_NETWORK_RATE = Rate(2e-3, 2e-4)
 
 
 class FeatureAppearance(nn.Module):
@@ -28,12 +30,12 @@ class FeatureAppearance(nn.Module):
     no_bias1: Tensor
     no_bias2: Tensor
 
-    def __init__(self, like: Tensor, features: int, hidden: int):
+    def __init__(self, like: Tensor, features: int):
         """Random weights of the dtype and device of `like`. Features of 0 mean that nothing changes at first."""
         super().__init__()
-        self.first = nn.Linear(features, hidden, bias=False).to(like)
-        self.last = nn.Linear(hidden, _OUTPUTS, bias=False).to(like)
-        self.register_buffer("no_bias1", like.new_zeros(hidden), persistent=False)
+        self.first = nn.Linear(features, _HIDDEN, bias=False).to(like)
+        self.last = nn.Linear(_HIDDEN, _OUTPUTS, bias=False).to(like)
+        self.register_buffer("no_bias1", like.new_zeros(_HIDDEN), persistent=False)
         self.register_buffer("no_bias2", like.new_zeros(_OUTPUTS), persistent=False)
         self._gradient = FactoredGradient()
 
@@ -49,12 +51,12 @@ class FeatureAppearance(nn.Module):
         own = neutral.new_zeros(len(neutral), 0)
         return feature_network(bases, activations.detach(), neutral, own, self.layers(), self._gradient)
 
-    def parameter_groups(self, store: GaussianStore, rate: Rate, network_rate: Rate) -> list[ParameterGroup]:
+    def parameter_groups(self, store: GaussianStore) -> list[ParameterGroup]:
         """The groups of the features and of the network."""
         return [
-            store_group(store, "neutral_features", rate),
-            factored_group(store, "feature_bases", rate, self._gradient),
-            network_group("appearance", self, network_rate),
+            store_group(store, "neutral_features", _RATE),
+            factored_group(store, "feature_bases", _RATE, self._gradient),
+            network_group("appearance", self, _NETWORK_RATE),
         ]
 
     def bake(self, store: GaussianStore) -> FeatureChanges:

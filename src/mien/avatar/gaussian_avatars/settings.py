@@ -14,34 +14,7 @@ from mien.avatar.settings import (
 )
 from mien.disk.config import FRACTION, NOT_NEGATIVE, NotBelow, Range, overlay
 
-
-@dataclass(frozen=True)
-class SurfaceLimits:
-    """Limits that keep Gaussians flat on the mesh, where one camera cannot see how deep they lie.
-
-    Lengths are those of the neutral head. Without limits, skin that was trained from the front falls to shards when it
-    is seen from the side.
-    """
-
-    enabled: bool = False
-    """Whether the limits are kept, by a correction after each step. They are always kept where sides are filled
-    (`--training.unseen`)."""
-    depth: Annotated[float, Range(0, 0.1)] = 0.003
-    """Largest distance of a centre from the mesh along the triangle's normal, in metres."""
-    hair_share: Annotated[float, Range(0, 10)] = 1.3
-    """How far a centre may lie above the scalp, beside the depth, as a multiple of the height of hair."""
-    thickness: Annotated[float, Range(1e-5, 0.1)] = 0.0005
-    """Largest scale (standard deviation) along the normal, in metres."""
-    hair_thickness: Annotated[float, Range(0, 10)] = 0.3
-    """What is added to the thickness on the scalp, as a multiple of the height of hair."""
-    width: Annotated[float, Range(1e-5, 1)] = 0.006
-    """Largest scale along the surface, in metres."""
-    hair_width: Annotated[float, Range(0, 10)] = 1.0
-    """What is added to the width on the scalp, as a multiple of the height of hair."""
-    ratio: Annotated[float, Range(1, 1000)] = 5.0
-    """Largest ratio of the two scales along the surface. Larger ones are needles."""
-    tilt: Annotated[float, Range(0, 180)] = 20.0
-    """Largest angle between a Gaussian's thin axis and the normal, in degrees."""
+ChangeKind = Literal["color", "opacity", "offset"]
 
 
 @dataclass(frozen=True)
@@ -76,27 +49,11 @@ class GaussianAvatarsConfig(MethodConfig):
     means_times_extent: bool = False
     """Whether the learning rate of the centres is multiplied by the extent of the training cameras in metres, as in the
     paper."""
-    log_scales_rate: Rate = Rate(0.017)
-    """Learning rate of the logarithms of the scales, per step."""
-    quats_rate: Rate = Rate(1e-3)
-    """Learning rate of the rotations (quaternions), per step."""
-    opacity_rate: Rate = Rate(0.05)
-    """Learning rate of the opacities (logits), per step."""
-    color_rate: Rate = Rate(2.5e-3)
-    """Learning rate of the constant colour coefficients, per step. Coefficients of higher degrees have a constant rate:
-    a twentieth of the start of this rate."""
     expression_rank: Annotated[int, Range(0, 8)] = 4
     """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say: wrinkles, or
     shoulders that stay while the head turns. 0 is the paper's method, without such changes."""
-    expression_color_rate: Rate = Rate(0.0)
-    """Learning rate of the changes of colour with the expression, in colour coefficients per unit of an activation and
-    step. If its start is 0, colours do not change."""
-    expression_opacity_rate: Rate = Rate(0.0)
-    """Learning rate of the changes of opacity (logits) with the expression, per unit of an activation and step. If its
-    start is 0, opacities do not change."""
-    expression_offset_rate: Rate = Rate(1e-3, 1e-5)
-    """Learning rate of the changes of place with the expression, in triangle units per unit of an activation and step.
-    If its start is 0, places do not change."""
+    expression_changes: tuple[ChangeKind, ...] = ("offset",)
+    """Which of a Gaussian's values change linearly with these activations: colour, opacity and place (offset)."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
     appearance: Literal["static", "features"] = "features"
@@ -107,24 +64,13 @@ class GaussianAvatarsConfig(MethodConfig):
     of `expression_rank`, so there are at least as many."""
     appearance_features: Annotated[int, Range(1, 256)] = 16
     """Number of features of each Gaussian, with `appearance` features."""
-    appearance_hidden: Annotated[int, Range(1, 1024)] = 32
-    """Width of the only hidden layer of the features' network."""
-    appearance_rate: Rate = Rate(2.5e-3)
-    """Learning rate of the features, per step."""
-    appearance_network_rate: Rate = Rate(2e-3, 2e-4)
-    """Learning rate of the features' network, per step."""
-    appearance_weight: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Weight of the mean squared changes of colour and opacity by features."""
-    position_threshold: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Distance from the triangle's centre up to which a Gaussian's centre has no penalty, in triangle units."""
     position_weight: Annotated[float, NOT_NEGATIVE] = 0.01
-    """Weight of the position penalty, which is the distance beyond the position threshold."""
+    """Weight of the penalty of centres that are further from their triangle's centre than one triangle unit."""
     scale_threshold: Annotated[float, NOT_NEGATIVE] = 0.6
     """Scale up to which a Gaussian has no penalty, in triangle units."""
-    scale_weight: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Weight of the scale penalty, which is the scale beyond the scale threshold."""
-    surface: SurfaceLimits = field(default_factory=SurfaceLimits)
-    """Limits that keep Gaussians on the surface of the mesh."""
+    surface_limits: bool = False
+    """Whether Gaussians are kept flat on the mesh by a correction after each step, so that skin does not fall to shards
+    from the side. They always are where sides are filled (`--training.unseen`)."""
     density: GradientSettings = field(default_factory=lambda: GradientSettings(grow_gradient=1e-4))
     """Density control: when and where Gaussians are added and removed."""
 
@@ -150,8 +96,7 @@ _PUBLISHED: dict[str, Any] = {
     "photometric": {"alpha_weight": 0.0, "part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
     "appearance": "static",
     "expression_rank": 0,
-    "expression_color_rate": {"start": 1e-3},
-    "expression_opacity_rate": {"start": 0.01},
+    "expression_changes": ["color", "opacity", "offset"],
     "face_tuning": {"keep_mean_pose": False, "keep_turns": False},
 }
 """Takes away what the defaults add to the paper."""
@@ -161,10 +106,10 @@ _PAPER: dict[str, Any] = _PUBLISHED | {
     "means_times_extent": True,
     "face_tuning": _PUBLISHED["face_tuning"]
     | {
-        "expression": {"start": _VISIT * 1e-3},
-        "joints": {"start": _VISIT * 1e-5},
-        "head_rotation": {"start": _VISIT * 1e-5},
-        "head_translation": {"start": _VISIT * 1e-6},
+        "expression": _VISIT * 1e-3,
+        "joints": _VISIT * 1e-5,
+        "head_rotation": _VISIT * 1e-5,
+        "head_translation": _VISIT * 1e-6,
     },
     "density": {
         "start": (_FIRST + _ROUND) / _STEPS,
@@ -174,7 +119,7 @@ _PAPER: dict[str, Any] = _PUBLISHED | {
         "size_unit": "extent",
         "split_size": 0.01,
         "prune_radius": 20.0,
-        "rules": {"prune_wide": False},  # as the published code does, and by measurement (docs/log.md)
+        "rules_off": ["prune_wide"],  # as the published code does, and by measurement (docs/log.md)
         "opacity_resets": [step / _STEPS for step in (_FIRST, *range(_RESET, _STEPS, _RESET))],
         "max_gaussians": 200_000,
     },

@@ -10,7 +10,7 @@ from mien.disk.config import NOT_NEGATIVE, Above, Range, ToLoad
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 _WIDTH = Range(1, 1024)
-_RATE = Rate(4e-4, begin=0.1)
+_FACE_RATE = 4e-4
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Weights of the losses that compare a rendering with its target. The weights of L1 and 1 - SSIM are the
     paper's."""
     face_tuning: FaceTuning = FaceTuning(
-        expression=_RATE, joints=_RATE, head_rotation=_RATE, head_translation=Rate(1.2e-4, begin=0.1)
+        expression=_FACE_RATE, joints=_FACE_RATE, head_rotation=_FACE_RATE, head_translation=1.2e-4, begin=0.1
     )
     """Whether and how fast training changes the tracked face parameters of each frame. This begins after a tenth of
     the run; in the paper, with epoch 10."""
@@ -107,14 +107,14 @@ class MonoGaussianAvatarConfig(MethodConfig):
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500
 """The preset `paper` spans the epochs up to which results are published, over a video of 100 seconds."""
-_PAPER_RATE = {"start": 5e-4, "begin": 10 / _PAPER_EPOCHS}
 _PAPER: dict[str, Any] = {
     "photometric": {"perceptual": {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3}},
     "face_tuning": {
-        "expression": _PAPER_RATE,
-        "joints": _PAPER_RATE,
-        "head_rotation": _PAPER_RATE,
-        "head_translation": {"start": 0.0, "begin": 0.0},
+        "expression": 5e-4,
+        "joints": 5e-4,
+        "head_rotation": 5e-4,
+        "head_translation": 0.0,
+        "begin": 10 / _PAPER_EPOCHS,
     },
     "frames_per_step": 8,
     "start": "sphere",

@@ -8,7 +8,7 @@ from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, Method
 from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)
-_RATE = Rate(4e-4, begin=0.1)
+_FACE_RATE = 4e-4
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class PointAvatarConfig(MethodConfig):
     photometric: Photometric = Photometric(l1_weight=1.0, ssim_weight=0.25, alpha_weight=1.0)
     """Weights of the losses that compare a rendering with its target. The paper has no SSIM."""
     face_tuning: FaceTuning = FaceTuning(
-        expression=_RATE, joints=_RATE, head_rotation=_RATE, head_translation=Rate(1.2e-4, begin=0.1)
+        expression=_FACE_RATE, joints=_FACE_RATE, head_rotation=_FACE_RATE, head_translation=1.2e-4, begin=0.1
     )
     """Whether and how fast training changes the tracked face parameters of each frame."""
     frames_per_step: Annotated[int, Range(1, 64)] = 2
@@ -83,17 +83,17 @@ class PointAvatarConfig(MethodConfig):
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 60, 2_500
 """The preset `paper` is a video of 100 seconds, over as many epochs as the number of points needs and 20 more."""
-_PAPER_RATE = {"start": 5e-4, "begin": 10 / _PAPER_EPOCHS}
 _PAPER: dict[str, Any] = {
     "photometric": {
         "ssim_weight": 0.0,
         "perceptual": {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3},
     },
     "face_tuning": {
-        "expression": _PAPER_RATE,
-        "joints": _PAPER_RATE,
-        "head_rotation": _PAPER_RATE,
-        "head_translation": {"start": 0.0, "begin": 0.0},
+        "expression": 5e-4,
+        "joints": 5e-4,
+        "head_rotation": 5e-4,
+        "head_translation": 0.0,
+        "begin": 10 / _PAPER_EPOCHS,
     },
     "frames_per_step": 1,
     "start": "sphere",

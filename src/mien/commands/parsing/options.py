@@ -19,7 +19,7 @@ from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device
 from mien.training.settings import MAIN_SETTINGS, PRESETS, Split, TrainSettings, doubly_held_out
-from mien.training.splits.named import NAMED_SPLIT
+from mien.training.settings.splits import NAMED_SPLIT
 
 if TYPE_CHECKING:
     PresetName = str

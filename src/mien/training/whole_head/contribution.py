@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
+from mien.avatar.bound_surface import BoundSurface
 from mien.camera import Camera
 from mien.face.params import FaceParams
 from mien.gaussians import SH_C0
@@ -48,7 +49,7 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
 
 
 def prune_hidden(
-    avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool
+    avatar: Avatar, surface: BoundSurface, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool
 ) -> Bool[Tensor, " n"]:
     """Deal with Gaussians that hardly add to any view, and return which are to be removed.
 
@@ -56,14 +57,13 @@ def prune_hidden(
     shape and opacity of a fill. Made-up sides and the inside of the mouth are left alone.
 
     Args:
-        avatar: An avatar with bound Gaussians.
+        avatar: An avatar whose Gaussians are bound to the surface.
+        surface: The surface.
         unseen: What the training pictures do not show of the head.
         views: Views of the training, as for `contributions`.
         close: Whether what stays becomes a surface, which training then fits to the pictures.
     """
-    surface, prior = avatar.surface(), unseen.prior
-    assert surface is not None
-    triangles = surface.triangles()
+    prior, triangles = unseen.prior, surface.triangles()
     kept = prior.filled_in if prior.closed is None else prior.closed
     assert kept is not None
     hidden = (contributions(avatar, views) < _HIDDEN_CONTRIBUTION) & ~kept[triangles]

@@ -197,11 +197,11 @@ def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Te
     return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
 
 
-def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:
+def side_views_of(face_model: FaceModel, unseen: Unseen | None, weight: float) -> SideViews | None:
     """The side views of a filled head, or None if nothing is filled or the weight is 0."""
     if unseen is None or unseen.prior.filled_in is None or weight == 0:
         return None
-    model, prior = avatar.face_model, unseen.prior
+    model, prior = face_model, unseen.prior
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
     assert prior.colors is not None
     return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))

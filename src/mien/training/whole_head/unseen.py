@@ -17,10 +17,9 @@ from torch.nn.functional import softshrink
 
 from mien.arrays import clear_rows
 from mien.avatar.avatar import Avatar
-from mien.avatar.bound_surface import SurfacePrior
-from mien.avatar.density import DensityControl
+from mien.avatar.bound_surface import BoundSurface, SurfacePrior
+from mien.avatar.density import DensityControl, GradientDensity
 from mien.avatar.settings import Photometric
-from mien.avatar.store import GaussianStore
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -83,21 +82,24 @@ class Unseen:
         """Whether some sides are filled rather than trained."""
         return self.prior.filled_in is not None
 
+    def to(self, like: Tensor) -> "Unseen":
+        """The same on the device of `like`."""
+        return replace(self, prior=self.prior.to(like))
+
     def weights(self, weights: Photometric) -> Photometric:
         """The weights of the losses, with a loss of alpha if anything is filled."""
         if not self.fills:
             return weights
         return replace(weights, alpha_weight=max(weights.alpha_weight, _FILL_ALPHA_WEIGHT))
 
-    def filled_in(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
+    def filled_in(self, surface: BoundSurface) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
-        surface = avatar.surface()
         filled_in = self.prior.filled_in
-        return None if filled_in is None or surface is None else filled_in.index_select(0, surface.triangles())
+        return None if filled_in is None else filled_in.index_select(0, surface.triangles())
 
-    def mask_gradients(self, avatar: Avatar, *renderings: Rendering) -> None:
-        """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
-        filled_in = self.filled_in(avatar)
+    def mask_gradients(self, avatar: Avatar, surface: BoundSurface, *renderings: Rendering) -> None:
+        """Take the gradients from what is filled, after the backward pass, but for strong ones of its height."""
+        filled_in = self.filled_in(surface)
         if filled_in is None:
             return
         store = avatar.gaussian_store()
@@ -123,19 +125,14 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
     return settings.unseen == "filled"
 
 
-def spare_fills(avatar: Avatar, density: DensityControl, unseen: Unseen) -> DensityControl:
-    """An avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
-    if unseen.prior.closed is None:
+def spare_fills(surface: BoundSurface, density: DensityControl, unseen: Unseen) -> DensityControl:
+    """A density control by which closed surfaces keep their opacity at resets, and fills do not count to its limit."""
+    closed, filled_in = unseen.prior.closed, unseen.filled_in(surface)
+    if closed is None or not isinstance(density, GradientDensity):
         return density
-
-    def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
-        closed, surface = unseen.prior.closed, avatar.surface()
-        assert closed is not None
-        assert surface is not None
-        return ~closed[surface.triangles()]
-
-    filled_in = unseen.filled_in(avatar)
-    return density.sparing(may_reset, 0 if filled_in is None else int(filled_in.sum()))
+    extra = 0 if filled_in is None else int(filled_in.sum())
+    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + extra)
+    return replace(density, settings=settings, may_reset=lambda store: ~closed[surface.triangles()])
 
 
 @torch.no_grad()
@@ -156,8 +153,6 @@ def unseen_of(
     colors = complete_colors(model, neutral, seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
-    if avatar.surface() is None:
-        return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     filled_in = (shown < UNSEEN_CONFIDENCE) & (found.above > 0.5)
     outside = (found.above > 0.5) & ~parts.interior
     behind_head = back_hair(model, neutral, hair, hanging)
@@ -273,18 +268,3 @@ def hidden_inside(
     for shown in stream_in_threads(shown_in, looked):
         sights += shown
     return interior & (sights < _MOUTH_SHOWN_SHARE * len(looked))
-
-
-def moved(unseen: Unseen, like: Tensor) -> Unseen:
-    """The same on the device of `like`."""
-    prior = unseen.prior
-    put = {
-        "hanging": None if prior.hanging is None else prior.hanging.to(like),
-        "colors": None if prior.colors is None else prior.colors.to(like),
-        "doubt": None if prior.doubt is None else prior.doubt.to(like),
-        "filled_in": None if prior.filled_in is None else prior.filled_in.to(like.device),
-        "closed": None if prior.closed is None else prior.closed.to(like.device),
-        "strands": None if prior.strands is None else prior.strands.to(like.device),
-        "widening": None if prior.widening is None else prior.widening.to(like),
-    }
-    return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))

@@ -1,21 +1,18 @@
-"""TrainSettings, the settings of a run that do not depend on the method, and presets of them. Needs no torch."""
+"""Settings of a run that do not depend on the method, their presets, and those of the alignment. Needs no torch."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from mien.avatar.methods import method_named
 from mien.avatar.settings import Differences, MethodConfig
-from mien.disk.config import FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges, overlay
+from mien.disk.config import COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges, overlay
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.machine.devices import DeviceName
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars", "nersemble-benchmark", "dataset"]
-"""Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
-camera instead (`mien.training.splits.named`), and so does nersemble-benchmark
-(`mien.training.splits.benchmark`). dataset holds out what the authors of an imported dataset held out
-(`mien.training.splits.own`)."""
+"""Name of a split (`mien.training.settings.splits`)."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ class TrainSettings:
     """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
     avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
     backgrounds. Cleaned: the colours of the person alone, as estimated from what is solid nearby. Auto: cleaned where
-    sides are filled (`--training.unseen`), else filmed. Scores do not depend on it (`mien evaluate --edges`)."""
+    sides are filled (`--training.unseen`), else filmed."""
     frame_order: Literal["even", "rare"] = "even"
     """How often frames are drawn: each equally often, or those with a rare expression up to four times as often as
     those with a common one."""
@@ -55,8 +52,6 @@ class TrainSettings:
     change. It is used only in training and in scores: the avatar has the mean light. The gain of a held-out timestep
     is interpolated in time from those that are trained on. Auto: changing if one camera filmed and the brightness of
     the face changes by a factor of more than 1.35, else steady."""
-    camera_color_rate: Annotated[float, POSITIVE] = 1e-3
-    """Learning rate of these changes and gains, per step. It ends at a tenth."""
     unseen: Literal["trained", "filled", "auto"] = "auto"
     """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
     broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
@@ -88,8 +83,6 @@ class TrainSettings:
     details get a little softer. Pictures whose longer side has fewer than 384 pixels are not halved."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
-    threads: Annotated[int, Range(0, 256)] = 0
-    """Number of threads of native operations. 0 means MIEN_THREADS or all cores. Results do not depend on it."""
     device: DeviceName = "cpu"
     """Device that training runs on. On `cuda` (through gsplat), the same seed does not give the same bytes."""
     checkpoint_every: Annotated[int, Range(1, 1_000_000_000)] = 1_000
@@ -132,6 +125,13 @@ def doubly_held_out(settings: TrainSettings) -> str | None:
         f"--split {settings.split} holds out a fifth of each other sequence as well, beside --hold-out "
         f"{' '.join(settings.held_out_sequences)}; add --split none to train on all of them"
     )
+
+
+def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
+    """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
+    if settings.background == "auto":
+        settings = replace(settings, background="mixed" if filled else "white")
+    return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
 
 
 @dataclass(frozen=True)
@@ -190,3 +190,28 @@ PRESETS = {
 }
 """Presets by name. `standard` is the defaults. `fine` takes twice as many steps. `paper` repeats the method's paper,
 and `paper-cpu` is the same in a size that a processor can train; not every method has them."""
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """Analysis by synthesis: a quick avatar is trained, and the face parameters of all frames are fitted to it."""
+
+    when: Literal["auto", "always", "never"] = "auto"
+    """Whether frames are aligned. Auto: if one camera filmed, the preset is not paper, and the run is not shorter than
+    the training of the quick avatar. Several cameras agree on the face already, and the papers train on the tracking
+    alone."""
+    template_steps: Annotated[int, COUNT] = 3_000
+    """Number of training steps of the quick avatar."""
+    template_gaussians: Annotated[int, COUNT] = 20_000
+    """Largest number of Gaussians of the quick avatar."""
+    resolution: Annotated[int, Range(16, MAX_SIDE)] = 256
+    """Longer side of the pictures, in pixels, for the quick avatar and for the alignment."""
+    iterations: Annotated[int, COUNT] = 8
+    """Number of optimiser steps for each frame."""
+    rate: Annotated[float, POSITIVE] = 7e-4
+    """How far a step turns a head whose gradient has the usual size, in radians. Its position moves by 0.3 of it, in
+    metres, joint angles by 3 times and expression coefficients by 10 times as much."""
+
+    def check(self) -> None:
+        """Check that all numbers are in their ranges."""
+        check_ranges(self, lambda name: f"--alignment.{name.replace('_', '-')}")

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.avatar import ParameterGroup
+from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning
 from mien.avatar.store import Moments
 from mien.face.params import FaceParams
@@ -130,8 +131,8 @@ class FaceTrack:
         groups = []
         for name, state in self._moments.items():
             row = Moments(state.first[index : index + 1], state.second[index : index + 1], state.step[index])
-            rate = getattr(self._tuning, name)
-            groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}))
+            rate, begin = Rate(getattr(self._tuning, name)), self._tuning.begin
+            groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}, begin=begin))
         return _Row(replace(self._start, **rows), groups)
 
     def params(self) -> FaceParams:
