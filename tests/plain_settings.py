@@ -37,11 +37,8 @@ def plain_gaussian_avatars(**changes: Any) -> GaussianAvatarsConfig:
 
 def plain_mono_gaussian_avatar(**changes: Any) -> MonoGaussianAvatarConfig:
     """Some hundred points that start on a sphere, as in the paper."""
-    rate = Rate(1e-3, begin=0.1)
     plain = MonoGaussianAvatarConfig(
-        face_tuning=FaceTuning(
-            expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(3e-4, begin=0.1)
-        ),
+        face_tuning=FaceTuning(begin=0.1),
         frames_per_step=1,
         start="sphere",
         pretraining=0,

@@ -75,8 +75,9 @@ def drawing(size: int = 8) -> Rendering:
 
 @pytest.mark.unchecked
 @pytest.mark.parametrize("right", ["first", "mean"])
-def test_the_gains_are_learned_and_the_background_stays(rig, right: str):
-    colors = colors_of(replace(SETTINGS, camera_colors=right, camera_color_rate=0.02), rig[1])
+def test_the_gains_are_learned_and_the_background_stays(rig, right: str, monkeypatch):
+    monkeypatch.setattr("mien.training.camera_colors.COLOR_RATE", 0.02)
+    colors = colors_of(replace(SETTINGS, camera_colors=right), rig[1])
     shown, adam = drawing(), Adam()
     behind = (1 - shown.alpha[..., None]) * BACKGROUND
     wanted = GAINS if right == "first" else GAINS / GAINS.mean(0)
@@ -109,8 +110,8 @@ def test_one_camera_is_refused_before_anything_is_written(rig, tmp_path: Path):
         train([rig[1]], rig[0], plain_gaussian_avatars(), settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     # Without the option nothing is stored.
-    parts = start([rig[1]], rig[0], plain_gaussian_avatars(), replace(SETTINGS, camera_colors="none")).parts
-    assert "colors" not in [part.name for part in parts]
+    state = start([rig[1]], rig[0], plain_gaussian_avatars(), replace(SETTINGS, camera_colors="none"))
+    assert state.camera_colors is None
 
 
 @pytest.mark.unchecked

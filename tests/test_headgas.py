@@ -11,7 +11,6 @@ from known import known
 from mien.adam import FactoredMoments, Moments
 from mien.avatar.avatar import neutral_of
 from mien.avatar.baking import make_portable
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import (
     HeadGas,
     input_directions,
@@ -22,6 +21,7 @@ from mien.avatar.headgas.avatar import (
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
+from mien.avatar.ops.points import positional_encoding
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.errors import UserError

@@ -9,7 +9,7 @@ from torch import Tensor
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.trained_frames import TrainedFrames, look_at_trained
 from mien.render.mesh import render_mesh
-from mien.training.footage.frames import Frame
+from mien.training.footage.frames import Footage, Frame
 from mien.training.footage.mesh_colors import vertex_colors
 
 
@@ -63,5 +63,5 @@ def make_baselines(
         trained: The means of the training frames, if they are known.
     """
     model, frames = experiment.avatar.face_model, experiment.training_frames
-    colors = vertex_colors(model, experiment.sequences, experiment.faces, frames, threads)
+    colors = vertex_colors(Footage(model, experiment.sequences, experiment.faces, frames), threads)
     return Baselines((trained or look_at_trained(experiment, 0, threads)).means, colors)

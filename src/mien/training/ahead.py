@@ -37,11 +37,7 @@ class TargetQueue:
         self._waiting: deque[Target | Future[Target]] = deque()
 
     def target(self, step: int) -> Target:
-        """The target of a step. Ask for the steps in their order; after a jump, the queue starts again.
-
-        Raises:
-            Exception: what reading or compositing the picture raised in the worker.
-        """
+        """The target of a step. Ask for the steps in their order; after a jump, the queue starts again."""
         if step != self._next - len(self._waiting):
             self.close()
             self._next = step

@@ -81,18 +81,8 @@ def align(
     """Train a template and align all frames of some sequences of one subject to it.
 
     Identity and offsets of the mesh stay. So does the mean of head poses, as Gaussians and poses could move together.
-
-    Args:
-        sequences: The sequences. `training` says what of them is held out.
-        face_model: The face model that they were tracked with.
-        settings: Settings of the template and of the alignment.
-        training: Settings of the run that the alignment is for. Its split, seed, device and threads are used.
-        folder: Where the template is trained, and the frames that are aligned are kept. What was stopped continues
-            there. It belongs to these sequences and settings alone.
-        progress: Makes progress bars.
-
-    Returns:
-        The face parameters of each sequence.
+    `training` is of the run that the alignment is for: what is held out, seed and device. The template is trained in
+    `folder`, where aligned frames are kept, too. What was stopped continues there.
     """
     config = overlay(
         PRESETS["draft"].config(DEFAULT_METHOD),
@@ -133,11 +123,7 @@ def steadier(tracked: FaceParams, aligned: FaceParams, trained: Bool[Tensor, " t
 
     Each frame is aligned on its own, which makes heads tremble. A tracking's errors change slowly, so its corrections
     are averaged over three timesteps. Expressions stay, since averaging them costs detail.
-
-    Args:
-        tracked: The face parameters as they were tracked.
-        aligned: The same, aligned.
-        trained: The timesteps that training uses. They take nothing from others, so that no held-out frame moves them.
+    Timesteps that training uses (`trained`) take nothing from others, so that no held-out frame moves them.
     """
     own, places = pose_corrections(tracked, aligned), torch.arange(len(aligned))
 
@@ -164,18 +150,8 @@ def align_faces(
 
     Each timestep descends on its own on L1 and SSIM, for the same number of steps (`FaceDescent`). Timesteps in which
     nothing was found, or in which a hand covers the face, get corrections from their neighbours.
-
-    Args:
-        avatar: The avatar, on the CPU. It is the same afterwards.
-        sequences: The sequences.
-        starts: The face parameters of each sequence to start from.
-        known: The frames that the avatar was trained on. Some of them say how large gradients are, and they alone say
-            what corrections of head poses share.
-        settings: Settings of the descent.
-        held_out_cameras: Ids of cameras that are not looked at.
-        folder: Where timesteps that are aligned are kept, for this call and no other. A stopped call continues there.
-        progress: Makes progress bars.
-        gains: Gain of each timestep of each sequence (`read_gains`). Default: steady light.
+    Some frames of `known`, on which the avatar was trained, say how large gradients are, and they alone say what
+    corrections of head poses share. With a folder, a stopped call continues there.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
     tuning, bounds = _tuning(settings, single), avatar.face_model.expression_bounds

@@ -24,12 +24,7 @@ _LAST_SHARE = 0.1  # the same at the last step, as a share of that at the first
 
 
 class LearnedColors:
-    """Numbers of colours that are learned beside the avatar, with their own state of the optimiser.
-
-    Args:
-        name: Name of their parameter group, and prefix of their tensors in checkpoints.
-        values: The numbers before the first step.
-    """
+    """Numbers of colours that are learned beside the avatar, with their own state of the optimiser."""
 
     def __init__(self, name: str, values: Tensor):
         self.values = values.detach().clone().requires_grad_()
@@ -65,14 +60,7 @@ def recolored(rendering: Rendering, background: Float[Tensor, " 3"], change: Flo
 
 
 class CameraColors:
-    """An affine map of colours for each camera id that is trained on. All start as the identity.
-
-    Args:
-        sequences: The sequences of a run.
-        frames: The frames that are trained on.
-        settings: The settings of the run.
-        like: The maps have its dtype and its device.
-    """
+    """An affine map of colours for each camera id that is trained on. All start as the identity."""
 
     def __init__(self, sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor):
         trained = {(frame.sequence, frame.camera) for frame in frames}

@@ -32,7 +32,8 @@ class TrainingState:
 
     avatar: Avatar
     adam: Adam
-    density: DensityStrategy
+    density: DensityStrategy | None
+    """None if the number of Gaussians never changes."""
     track: FaceTrack
     curves: dict[str, list[float]]
     head: WholeHead | None = None
@@ -65,7 +66,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     """Write a checkpoint into `folder` and delete all but the newest two."""
     state.measure_memory()
     tensors = {f"avatar.{name}": tensor for name, tensor in state.avatar.state_dict().items()}
-    tensors |= {f"density.{name}": tensor for name, tensor in state.density.state().items()}
+    if state.density is not None:
+        tensors |= {f"density.{name}": tensor for name, tensor in state.density.state().items()}
     tensors |= {f"track.{name}": tensor for name, tensor in state.track.state().items()}
     for prefix, joined in state.joined().items():
         tensors |= {f"{prefix}.{name}": tensor for name, tensor in joined.state().items()}
@@ -121,7 +123,8 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     like = store[store.names()[0]]
     store.moments.update(_moments(part("store."), like))
     state.adam.load_state(_moments(part("adam."), like))
-    state.density.load_state(part("density."))
+    if state.density is not None:
+        state.density.load_state(part("density."))
     state.track.load_state(part("track."))
     for prefix, joined in state.joined().items():
         joined.load_state(part(f"{prefix}."))

@@ -35,11 +35,6 @@ class FrameGains:
 
     They start from the brightness of the faces that are trained on. Their logarithms have a mean of 0 over these. A
     sequence that is not trained on has gains of 1.
-
-    Args:
-        sequences: The sequences of a run.
-        frames: The frames that are trained on.
-        like: The gains have its dtype and its device.
     """
 
     def __init__(self, sequences: Items[Sequence], frames: Items[Frame], like: Tensor):
@@ -110,12 +105,7 @@ def frame_gains(
 
 
 def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]:
-    """The gains of each sequence of a finished run. The list is empty if it was trained without any.
-
-    Args:
-        run_dir: The run's folder.
-        lengths: Number of timesteps of each sequence.
-    """
+    """The gains of each sequence of a finished run. The list is empty if it was trained without any."""
     path = run_dir / GAINS
     if not path.exists() and not path.is_symlink():
         return []

@@ -15,8 +15,8 @@ import torch
 
 import mien
 from mien.avatar.avatar import Avatar
+from mien.avatar.baking import measure_filmed
 from mien.avatar.files import write_avatar
-from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import method_of
 from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
@@ -93,10 +93,7 @@ def check_run(
 def check_videos(run_dir: Path, names: Items[str], known: Items[str]) -> None:
     """Check that a run was trained on the captures of these videos, before they are captured.
 
-    Args:
-        run_dir: folder of the run, which may be missing.
-        names: names of the videos. One with cuts becomes NAME-1, NAME-2, ...
-        known: names of the workspace's sequences. Those that are known may be left out of a run.
+    A video with cuts becomes NAME-1, NAME-2, ... Sequences of the workspace that are `known` may be left out of a run.
     """
     if not (run_dir / "config.json").is_file():
         return
@@ -176,15 +173,7 @@ def filmed_range(run_dir: Path, avatar: Avatar) -> Filmed:
 
 
 def write_imported_run(run_dir: Path, avatar: Avatar, face: FaceParams, camera: Camera, source: Path) -> None:
-    """Write a run around an avatar that another program trained. It can be rendered, driven and exported.
-
-    Args:
-        run_dir: The run's folder, which is empty or missing.
-        avatar: The avatar.
-        face: The subject at the timesteps that came with it.
-        camera: A good view of the avatar.
-        source: The place that it was imported from, for people.
-    """
+    """Write a run around an avatar that another program trained. It can be rendered, driven and exported."""
     content = {
         **_choices(avatar.config, replace(PRESETS["paper"].settings, steps=0)),
         "data": [{"sequence": _IMPORTED, "timesteps": len(face), "camera": _camera_entry(camera)}],
@@ -205,8 +194,7 @@ def is_finished(run_dir: Path) -> bool:
 def check_untouched(run_dir: Path) -> None:
     """Check before any work that no other process is training this run.
 
-    Raises:
-        BeingWrittenError: another process is.
+    Otherwise, this raises `BeingWrittenError`.
     """
     if not is_finished(run_dir):
         check_free(run_dir, BUSY_REMEDY)

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Posed, move_avatar
+from mien.avatar.baking import measure_filmed
 from mien.avatar.files import load_avatar
-from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import method_named, method_of
 from mien.avatar.schedules import Progress
 from mien.avatar.settings import FaceTuning, MethodConfig
@@ -50,6 +50,7 @@ from mien.training.footage.face_track import FaceTrack, turns_from_mean
 from mien.training.footage.frames import (
     DENSITY,
     BatchFrame,
+    Footage,
     FrameOrder,
     camera_extent,
     expression_rarity,
@@ -92,13 +93,7 @@ def train(
 
     If `run_dir` holds a stopped run with the same settings, training continues where it stopped, and the result has the
     same bytes as without the stop. If that run is finished, its avatar is loaded.
-
-    Raises:
-        UserError: a setting is out of range, or training diverges; trained features are not installed; `run_dir` holds
-            another run, or another process writes it; the face model differs from that of the tracking; the sequences
-            were not tracked together; or no frame is left to train on.
-        KeyboardInterrupt: after Ctrl-C, once a checkpoint is written.
-        Terminated: after SIGTERM, once a checkpoint is written.
+    Ctrl-C and SIGTERM (`Terminated`) are raised once a checkpoint is written.
     """
     method_config.check()
     settings.check()
@@ -130,12 +125,12 @@ def train(
         coarse = coarse_steps(targets, settings)
         halved = tuple(one.halved() for one in targets) if coarse else ()
         faces = [sequence.tracking.face for sequence in sequences]
-        looked = _REPRESENTATIVE_FRAMES
-        representative = representative_frames(faces, sequences, frames, looked, looked)
+        footage = Footage(face_model, sequences, faces, frames)
+        representative = representative_frames(footage, _REPRESENTATIVE_FRAMES, _REPRESENTATIVE_FRAMES)
         data = TrainingData(order, targets, extent, tuple(representative), halved, coarse)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
         known = None if head is None else head.coverage
-        write_results(run_dir, state, known or measure_coverage(face_model, sequences, faces, frames))
+        write_results(run_dir, state, known or measure_coverage(footage))
     return state.avatar
 
 
@@ -243,19 +238,20 @@ def start(
     # Nothing of a held-out frame may reach the avatar, not even how its face was tracked.
     shown = sorted(set(used))
     avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
-    fitted = fitted_faces(face_model, sequences, frames, settings, bound=avatar.surface() is not None)
+    footage = Footage(face_model, sequences, faces, frames)
+    fitted = fitted_faces(footage, settings, bound=avatar.surface() is not None)
     if fitted is not None:
-        faces = fitted
+        faces, footage = fitted, replace(footage, faces=fitted)
         avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     face = concatenate(faces)
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
     avatar.filmed = measure_filmed(face[used], avatar.subject, eyes)
     surface = avatar.surface()
     if surface is not None and surface.wants_first_colors:
-        surface.set_first_colors(vertex_colors(face_model, sequences, faces, frames))
+        surface.set_first_colors(vertex_colors(footage))
     like = torch.zeros(()) if like is None else like
     gains, colors = (make(sequences, frames, settings, like) for make in (frame_gains, camera_colors))
-    make_head = prepare_whole_head(avatar, sequences, faces, frames, settings)
+    make_head = prepare_whole_head(avatar, footage, settings)
     away = turns_from_mean(face, shown)
     move_avatar(avatar, like)
     face = face.to(like)
@@ -331,13 +327,16 @@ def _update(
     """Update all trained tensors, then add and prune Gaussians. Returns whether the Gaussians may have changed."""
     groups = [*state.avatar.parameter_groups(), *face_groups(state, batch)]
     groups += [group for own in state.colors for group in own.learned.parameter_groups()]
-    for own, rendering in zip(posed, renderings, strict=True):
-        state.density.observe(own, rendering)
+    if state.density is not None:
+        for own, rendering in zip(posed, renderings, strict=True):
+            state.density.observe(own, rendering)
     state.adam.step(groups, progress)
     for one in batch:
         state.track.confine(one.index)
     if progress.reaches(STEADY_EVERY):
         state.track.steady_pose()
+    if state.density is None:
+        return False
     random = partial(random_at, settings.seed, DENSITY, progress.step)
     return state.density.adapt(state.avatar.gaussian_store(), posed[0], progress, random)
 
@@ -349,7 +348,7 @@ def _after_update(
     head.after_update()
     head.move_hair(progress)
     last = progress.done >= progress.steps
-    if head.fills and (changed or last) and data.representative:
+    if state.density is not None and head.fills and (changed or last) and data.representative:
         track = state.track
 
         def redundant() -> Bool[Tensor, " n"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_surface import BoundSurface
-from mien.avatar.density import GradientDensity, highest_opacities_seen
+from mien.avatar.density import GradientDensity
 from mien.avatar.gaussian_avatars.changes import BASES, change_penalties
 from mien.avatar.gaussian_avatars.feature_appearance import FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
@@ -165,13 +165,13 @@ class GaussianAvatars(Avatar):
         return GradientDensity(
             self.config.density,
             opacity_logits="opacity_logits",
-            judged_opacities=highest_opacities_seen if self._opacity_changes else resting_opacities,
+            judged_opacities=None if self._opacity_changes else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""
-        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        store = self.store.arrays()
         sh = as_array(self._active_sh(TRAINED))
         return MeshBound(
             rig=bake_rig(self.face_model, self.subject),

@@ -18,12 +18,7 @@ APPEARANCE_WEIGHT = 0.1  # weight of the mean squared changes of colour and opac
 
 
 def change_penalties(config: GaussianAvatarsConfig, changes: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
-    """The weighted mean squared changes over all Gaussians: linear ones as `expression`, features' as `appearance`.
-
-    Args:
-        config: The settings, which have the weights.
-        changes: The changes of one or more timesteps by name; others are ignored.
-    """
+    """The weighted mean squared changes over all Gaussians: linear ones as `expression`, features' as `appearance`."""
     kinds = (("expression", BASES, config.expression_weight), ("appearance", _FEATURES, APPEARANCE_WEIGHT))
     losses = {}
     for loss, names, weight in kinds:

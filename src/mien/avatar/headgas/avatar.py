@@ -26,10 +26,8 @@ from mien.avatar.avatar import (
     network_group,
     store_group,
 )
-from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
-from mien.avatar.baking import as_array
+from mien.avatar.baking import Kept, as_array, can_pose_baked, pose_baked
 from mien.avatar.density import GradientDensity
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.variants import (
     ABLATIONS,
@@ -43,9 +41,9 @@ from mien.avatar.headgas.variants import (
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.expression_changes import expression_inputs, principal_directions
 from mien.avatar.ops.feature_network import Layers, feature_network
+from mien.avatar.ops.points import positional_encoding, sample_surface
 from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
-from mien.avatar.surface_places import sample_surface
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -169,7 +167,7 @@ class HeadGas(Avatar):
         """Static points, with the bases of the features and the network."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
-        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        store = self.store.arrays()
         n = len(self.store)
         neutral, along = self._baked_features()
         layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]

@@ -36,19 +36,9 @@ def strand_gaussians(
 ) -> dict[str, Tensor]:
     """Gaussians that look like strands, in the frames and units of their triangles. They are the same in every call.
 
-    Strands lie on the surface of the hair, point down and back, and differ in brightness. Their number is that of the
-    chosen triangles' area, evenly spread.
-
-    Args:
-        vertices: The neutral head in the head frame (y up, z ahead), in metres, on the CPU.
-        faces: Its triangles.
-        chosen: Triangles that get strands.
-        height: Height of the hair above each triangle, in metres.
-        colors: Colours of the triangles, 0..1.
-
-    Returns:
-        The tensors `face_index, means, quats, log_scales, opacity_logits, sh_constant` of a store, with one row for
-        each strand.
+    Strands lie on the surface of the hair, point down and back, and differ in brightness. They are evenly spread over
+    the chosen triangles of a neutral head in the head frame (y up, z ahead), in metres. Colours are 0..1. The result
+    has the tensors of a store, with one row for each strand.
     """
     vertices, random = vertices.detach(), torch.Generator().manual_seed(0)
     frames = triangle_frames(vertices, faces)

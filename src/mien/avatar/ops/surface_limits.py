@@ -32,12 +32,8 @@ def limits_of_triangles(
     """The limits in the frames of the triangles, for `keep_on_surface`.
 
     They are the lowest and the highest place along the normal, the logarithms of the largest thickness and width, and
-    the sine of half the largest tilt.
-
-    Args:
-        sizes: Sizes of the triangles, in metres per triangle unit.
-        hair: Height of hair above each triangle, in metres; 0 where there is none.
-        widening: Factors on the depth, the thickness and the tilt. None means 1.
+    the sine of half the largest tilt. Sizes are in metres per triangle unit, heights of hair in metres, and `widening`
+    are factors on depth, thickness and tilt.
     """
     widen = torch.ones_like(sizes) if widening is None else widening
     depth, thickness = DEPTH * widen, THICKNESS * widen
@@ -52,11 +48,7 @@ def limits_of_triangles(
 def keep_on_surface(store: Tensors, limits: Float[Tensor, "f 5"], pulls: Float[Tensor, "f 4"] | None = None) -> None:
     """Bring Gaussians that are beyond the limits back to them, in place. Native for float32 on a CPU.
 
-    Args:
-        store: Gaussians with `face_index, means, quats, log_scales` in the frames of their triangles.
-        limits: The limits of the triangles (`limits_of_triangles`).
-        pulls: Of each triangle, a first SH coefficient and the share of the way that colours go towards it. None means
-            that colours stay.
+    `pulls` are, of each triangle, a first SH coefficient and the share of the way that colours go towards it.
     """
     names = ("means", "quats", "log_scales")
     arrays = [store[name].detach() for name in names]

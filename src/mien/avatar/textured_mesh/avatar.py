@@ -24,9 +24,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from mien.avatar.avatar import UNBAKED_REMEDY, Avatar, Extras, ParameterGroup, Posed, store_group
-from mien.avatar.baked_pose import Kept
-from mien.avatar.baking import as_array, bake_rig
-from mien.avatar.density import FixedDensity
+from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
 from mien.avatar.ops.triangle_frames import corners_in_frames, ellipses_of_corners, triangle_frames
@@ -128,9 +126,8 @@ class TexturedMesh(Avatar):
         """Every per-surfel tensor."""
         return self.store
 
-    def density(self) -> FixedDensity:
+    def density(self) -> None:
         """The surfels stay where they are."""
-        return FixedDensity()
 
     @torch.no_grad()
     def bake(self) -> MeshBound:
@@ -178,10 +175,7 @@ class TexturedMesh(Avatar):
 
     def _surfels(self) -> Surfels:
         """The places of the surfels of the store."""
-        try:
-            return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
-        except ValueError as error:
-            raise UserError(f"cannot be posed ({error})") from None
+        return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
 
     def _moved_subject(self, offsets: Float[Tensor, "v 3"]) -> FaceParams:
         own = self.subject.vertex_offsets

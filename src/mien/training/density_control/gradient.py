@@ -120,7 +120,7 @@ class GradientStrategy(DensityStrategy):
         if settings.size_unit == "extent":
             sizes = sizes / progress.extent
         prune = self._to_prune(store, sizes, progress)
-        if "never_empty" not in off:
+        if self._density.may_prune is not None and "never_empty" not in off:
             prune = self._density.may_prune(store, prune)
         if bool(prune.all()):
             # Without any Gaussian there are no gradients to grow by, so keep the one that was most visible.
@@ -143,7 +143,9 @@ class GradientStrategy(DensityStrategy):
         settings, off = self._density.settings, self._density.settings.rules_off
         prune = torch.zeros_like(sizes, dtype=torch.bool)
         if "prune_faint" not in off:
-            prune = self._density.judged_opacities(store, self._highest_opacities) < PRUNE_OPACITY
+            judged = self._density.judged_opacities
+            seen = self._highest_opacities
+            prune = (seen if judged is None else judged(store, seen)) < PRUNE_OPACITY
         begin = settings.size_start
         if begin is None:
             begin = min((time for time in settings.opacity_resets if time > settings.start), default=math.inf)

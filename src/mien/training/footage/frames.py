@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.errors import UserError
+from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.training.footage.sequence import Sequence, Target
 from mien.training.settings import Split, TrainSettings, check_held_out
@@ -46,6 +47,37 @@ class Frame(NamedTuple):
     sequence: int
     timestep: int
     camera: int
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """The frames that a run trains on, on the CPU in float32."""
+
+    face_model: FaceModel
+    sequences: Items[Sequence]
+    faces: Items[FaceParams]
+    """Face parameters of each sequence, with all its timesteps."""
+    frames: Items[Frame]
+
+    def face(self, frame: Frame) -> FaceParams:
+        """The face in a frame."""
+        return self.faces[frame.sequence][frame.timestep]
+
+    def vertices(self, frame: Frame) -> Float[Tensor, "v 3"]:
+        """The posed mesh in a frame, in world space, in metres."""
+        return self.face_model(self.face(frame))[0]
+
+    def camera(self, frame: Frame) -> Camera:
+        """The camera of a frame."""
+        return self.sequences[frame.sequence].tracking.cameras[frame.camera]
+
+    def matte(self, frame: Frame) -> UInt8[np.ndarray, "h w"]:
+        """Opacity of the person, not cut at the neck."""
+        return np.asarray(self.sequences[frame.sequence].capture.mattes[frame[1:]])
+
+    def scoring(self, frame: Frame) -> UInt8[np.ndarray, "h w"]:
+        """Opacity of the pixels that count."""
+        return np.array(self.sequences[frame.sequence].scoring[frame[1:]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +192,8 @@ def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float
 class FrameOrder:
     """Shuffled passes over the training frames.
 
-    Args:
-        frames: The frames. A pass has as many steps.
-        seed: Seed of the shuffling.
-        weights: How often each frame is drawn, relative to the others. A pass has every frame as often as its share
-            says, rounded down or up at random. None draws every frame once.
+    `weights` say how often each frame is drawn, relative to the others: a pass has every frame as often as its share
+    says, rounded down or up at random. None draws every frame once.
     """
 
     def __init__(self, frames: Items[Frame], seed: int, weights: Float[Tensor, " n"] | None = None):

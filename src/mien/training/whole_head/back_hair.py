@@ -43,13 +43,9 @@ def back_hair(
 ) -> Float[Tensor, " f"]:
     """Return the height of hair that hangs behind the head, along the triangles' normals, in metres, 0..0.08.
 
-    It is 0 on triangles that face forward, where hair does not hang to their level, and everywhere on short hair.
-
-    Args:
-        face_model: The face model.
-        vertices: The person's neutral head in the head frame (y up, z ahead), in metres, on the CPU.
-        hair: Height of the hair above the scalp (`hair_height`), in metres.
-        hanging: How far hair stands out beside skin and neck (`hanging_hair`), in metres.
+    It is 0 on triangles that face forward, where hair does not hang to their level, and everywhere on short hair. The
+    vertices are those of the neutral head in the head frame (y up, z ahead), in metres, on the CPU. `hair` and
+    `hanging` are from `hair_height` and `hanging_hair`.
     """
     middles, _, normals = triangle_geometry(vertices.detach().float(), face_model.faces.cpu())
     parts, behind_head = head_parts(face_model), torch.zeros_like(hair)

@@ -7,13 +7,12 @@ from what was seen: hair over the scalp, skin over face, ears and neck. The insi
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.face.head_parts import HeadParts, head_parts, mouth_colors
-from mien.face.mirror import mirror_triangles, triangle_geometry
+from mien.face.mirror import mirror_triangles
 from mien.face.model import FaceModel
-from mien.render.mesh import shade
 from mien.training.whole_head.spreading import Surface
 
 _COLOR_SPREAD = 0.12  # distance between colours (0..1) over which a colour stops counting as skin or as hair
@@ -21,51 +20,27 @@ _TINT_SPREAD = 0.06  # the same for colours of equal brightness. Chosen with the
 _LIGHT_SPREAD = 0.25  # the same for the logarithm of their brightness beyond half or twice. Chosen with the rule alone
 _DIFFERENT_COLORS = 0.10  # distance between the medians of skin and hair from which their colours can be told apart
 _LARGEST_OFFSET = 0.25
-"""Largest difference of brightness between a triangle and its mirror image that counts as light, and between a triangle
-and its neighbours that counts as texture."""
-_LEAST_LIGHT = 0.1  # least light by which colours are divided
+"""Largest difference of brightness between a triangle and its mirror image that counts as light."""
 
 
 def complete_colors(
-    face_model: FaceModel,
-    template_vertices: Float[Tensor, "v 3"],
-    seen: Float[Tensor, " f"],
-    colors: Float[Tensor, "f 3"],
-    light: Float[Tensor, "9 3"] | None = None,
-    texture: float = 0.0,
+    face_model: FaceModel, vertices: Float[Tensor, "v 3"], seen: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3"]:
-    """Return a colour for every triangle: its own as far as it was seen, else one that is made up.
+    """Return a colour for every triangle, 0..1: its own as far as it was seen (0..1), else a completed one.
 
-    A colour is made up from the mirror image as far as that was seen. The difference between both sides, measured where
+    A colour comes from the mirror image as far as that was seen. The difference between both sides, measured where
     both were seen, is spread over the head and added, so that no border shows. What neither side shows spreads from the
     nearest seen triangles of the same kind: scalp from scalp that looks like hair, face and ears from what looks like
     skin, neck from either (so that long hair goes on behind). Mouth, teeth and tongue get dark, light and red colours
-    that fade with the depth behind the lips.
-
-    Args:
-        face_model: The face model.
-        template_vertices: The person's neutral head in the head frame, in metres.
-        seen: Confidence in each triangle's colour, 0..1. Values that are not finite count as 0.
-        colors: Colours in the pictures, 0..1. A triangle whose colour is not finite counts as not seen.
-        light: Spherical harmonics of the light over normals of the head frame (`mien.render.mesh.shade`). It is taken
-            out before colours are made up, and put back after. None leaves colours as they are.
-        texture: Share of the seen triangles' contrast that made-up colours of hair and skin get as noise, 0..1.
-
-    Returns:
-        Finite colours, 0..1. They equal `colors` where `seen` is 1.
+    that fade with the depth behind the lips. The vertices are those of the neutral head in the head frame, in metres.
+    What is not finite counts as not seen.
     """
     seen, colors = _cleaned(seen, colors)
-    vertices = template_vertices.detach().to(colors)
-    parts = head_parts(face_model)
-    mesh = Surface.of(vertices, face_model.faces.cpu())
-    shading = torch.ones_like(colors) if light is None else _shading(vertices, face_model.faces.cpu(), light)
-    albedo = colors / shading
+    parts, mesh = head_parts(face_model), Surface.of(vertices.detach().to(colors), face_model.faces.cpu())
     known = seen * _trust(parts, mesh.middles, seen, colors)
-    filled_in = _spread_by_part(parts, mesh, known, albedo)
-    if texture > 0:
-        filled_in = filled_in + texture * _noise(parts, mesh, known, albedo)
-    mirrored, share = _mirrored(face_model, mesh, seen, known, albedo)
-    filled_in = torch.lerp(filled_in, mirrored, share[:, None]) * shading
+    filled_in = _spread_by_part(parts, mesh, known, colors)
+    mirrored, share = _mirrored(face_model, mesh, seen, known, colors)
+    filled_in = torch.lerp(filled_in, mirrored, share[:, None])
     brightness = _brightness(parts, seen, colors)
     filled_in = torch.where(parts.interior[:, None], brightness * mouth_colors(parts, mesh.middles), filled_in)
     return torch.where(seen[:, None] >= 1, colors, torch.lerp(filled_in.clamp(0, 1), colors, seen[:, None]))
@@ -88,14 +63,6 @@ def _cleaned(seen: Tensor, colors: Tensor) -> tuple[Float[Tensor, " f"], Float[T
     whole = seen.isfinite() & colors.isfinite().all(1)
     colors = torch.where(whole[:, None], colors, 0.5).clamp(0, 1)
     return torch.where(whole, seen, 0.0).clamp(0, 1), colors
-
-
-def _shading(
-    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], light: Float[Tensor, "9 3"]
-) -> Float[Tensor, "f 3"]:
-    normals = triangle_geometry(vertices, faces)[2]
-    shading = shade(normals, light.detach().to(vertices)).clamp_min(_LEAST_LIGHT)
-    return torch.where(shading.isfinite(), shading, 1.0)
 
 
 def _median(values: Float[Tensor, "f 3"], chosen: Bool[Tensor, " f"]) -> Float[Tensor, " 3"] | None:
@@ -167,21 +134,6 @@ def _mirrored(
     offset = (albedo - albedo[image]).clamp(-_LARGEST_OFFSET, _LARGEST_OFFSET)
     offset = torch.where((both > 0.05)[:, None], offset, 0.0)
     return albedo[image] + mesh.spread(offset, both, torch.ones_like(has)), torch.where(has, seen[image], 0.0)
-
-
-def _noise(
-    parts: HeadParts, mesh: Surface, known: Float[Tensor, " f"], albedo: Float[Tensor, "f 3"]
-) -> Float[Tensor, "f 3"]:
-    """Return the seen triangles' differences from their neighbours, dealt out to all triangles of their part."""
-    noise, most = torch.zeros_like(albedo), _LARGEST_OFFSET
-    random = torch.Generator().manual_seed(0)
-    for part in (parts.scalp, parts.skin | parts.neck):
-        sources = (part & (known > 0.8)).nonzero()[:, 0]
-        targets = part.nonzero()[:, 0]
-        if len(sources):
-            detail = (albedo - mesh.around(albedo, known * part))[sources].clamp(-most, most)
-            noise[targets] = detail[torch.randint(len(sources), (len(targets),), generator=random)]
-    return noise
 
 
 def _brightness(parts: HeadParts, seen: Float[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> float:

@@ -30,11 +30,7 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
     """The most that each Gaussian adds to one of the views: the sum of its weights in the blending, in pixels.
 
     The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it (3D Gaussian Splatting,
-    equation 3). It is the derivative of the picture by the Gaussian's colour.
-
-    Args:
-        avatar: The avatar.
-        views: A face at one timestep, and a camera, for each view.
+    equation 3). It is the derivative of the picture by the Gaussian's colour. A view is one timestep and a camera.
     """
     most = torch.zeros(len(avatar.gaussian_store()), device=avatar.face_model.template.device)
     for face, camera in views:
@@ -54,14 +50,8 @@ def prune_hidden(
     """Deal with Gaussians that hardly add to any view, and return which are to be removed.
 
     One Gaussian stays on each triangle. If it is hidden, it gets the completed colour and, with `close`, also place,
-    shape and opacity of a fill. Made-up sides and the inside of the mouth are left alone.
-
-    Args:
-        avatar: An avatar whose Gaussians are bound to the surface.
-        surface: The surface.
-        unseen: What the training pictures do not show of the head.
-        views: Views of the training, as for `contributions`.
-        close: Whether what stays becomes a surface, which training then fits to the pictures.
+    shape and opacity of a fill, which training then fits to the pictures. Filled sides and the inside of the mouth
+    are left alone.
     """
     prior, triangles = unseen.prior, surface.triangles()
     kept = prior.filled_in if prior.closed is None else prior.closed

@@ -1,21 +1,16 @@
 """How far hair stands out from the scalp of a face model, measured on the outlines of the mattes."""
 
-from collections.abc import Sequence as Items
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
-from mien.face.model import FaceModel
-from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
-from mien.training.footage.frames import Frame, spread_frames
-from mien.training.footage.sequence import Sequence
+from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.whole_head.spreading import Surface
 
 _HAIR_FRAMES = 60  # number of evenly spread frames whose outlines are measured
@@ -46,33 +41,20 @@ _HANGING_HAIR_ROUNDS = 4  # rings of triangles around an outline that hanging ha
 
 
 @torch.no_grad()
-def hair_height(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    threads: int | None = None,
-) -> Float[Tensor, " f"]:
+def hair_height(footage: Footage) -> Float[Tensor, " f"]:
     """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
     along its normal to the border of the matte. Triangles that are never on the outline have the height of what was
     measured where the head is as steep. Near skin, ears included, they have no more than hair that rises slowly from
     the hairline, where the height fades. Without any measurement it is 0.
-
-    Args:
-        face_model: The face model, float32 on the CPU.
-        sequences: The sequences that the frames count in.
-        faces: Face parameters of each sequence, with all its timesteps.
-        frames: The frames to look at. At most 60 of them, evenly spread, are used.
-        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
     """
-    parts = head_parts(face_model)
+    face_model, parts = footage.face_model, head_parts(footage.face_model)
     scalp = parts.scalp
-    height, known = _outline_heights(face_model, sequences, faces, frames, scalp, threads)
+    height, known = _outline_heights(footage, scalp)
     if not bool(known.any()):
         return height[:, 0]
-    vertices = face_model.rest_vertices(faces[0])
+    vertices = face_model.rest_vertices(footage.faces[0])
     surface, upward = Surface.of(vertices, face_model.faces), triangle_geometry(vertices, face_model.faces)[2][:, 1]
     most = _HAIR_GUESS_LIMIT * _on_top(surface, height, known)
     guess = _by_slope(surface, upward, height, known, scalp).clamp_max(most)
@@ -88,47 +70,29 @@ def hair_height(
 
 
 @torch.no_grad()
-def hanging_hair(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    threads: int | None = None,
-) -> Float[Tensor, " f"]:
+def hanging_hair(footage: Footage) -> Float[Tensor, " f"]:
     """Return how far the outline stands out beside skin and neck, in metres, 0..0.08; 0 on the scalp.
 
     Long hair hangs off the scalp, beside cheeks and neck, and rings hang from ears. Unlike `hair_height`, nothing is
-    concluded about triangles that are far from any outline. The arguments are those of `hair_height`.
+    concluded about triangles that are far from any outline.
     """
-    parts = head_parts(face_model)
+    face_model, parts = footage.face_model, head_parts(footage.face_model)
     beside = parts.skin | parts.neck
-    height, known = _outline_heights(face_model, sequences, faces, frames, beside, threads)
+    height, known = _outline_heights(footage, beside)
     if not bool(known.any()):
         return height[:, 0]
-    surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
+    surface = Surface.of(face_model.rest_vertices(footage.faces[0]), face_model.faces)
     for _ in range(_HANGING_HAIR_ROUNDS):
         height = torch.maximum(height, surface.around(height, torch.ones_like(known)))
         height[~beside] = 0
     return height[:, 0].clamp(0, HAIR_HIGHEST)
 
 
-def _outline_heights(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    region: Bool[Tensor, " f"],
-    threads: int | None,
-) -> tuple[Float[Tensor, "f 1"], Float[Tensor, " f"]]:
+def _outline_heights(footage: Footage, region: Bool[Tensor, " f"]) -> tuple[Float[Tensor, "f 1"], Float[Tensor, " f"]]:
     """Return the height of the outline above the triangles of a region, and how sure it is, 0..1; 0 elsewhere."""
-    chosen = region.nonzero()[:, 0]
-
-    def measured_in(frame: Frame) -> Tensor:
-        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
-        return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
-
-    used = spread_frames(frames, _HAIR_FRAMES)
-    heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
+    chosen, used = region.nonzero()[:, 0], spread_frames(footage.frames, _HAIR_FRAMES)
+    measured = list(stream_in_threads(lambda frame: _measured(footage, frame, chosen), used))
+    heights = torch.stack(measured) if used else torch.zeros(0, len(chosen))
     height, known = torch.zeros(len(region), 1), torch.zeros(len(region))
     found = heights.isfinite().any(0)
     if bool(found.any()):
@@ -174,12 +138,10 @@ def _behind_hairline(surface: Surface, scalp: Bool[Tensor, " f"], skin: Bool[Ten
     return _HAIRLINE_HEIGHT + _HAIRLINE_RISE * apart.amin(1)
 
 
-def _measured(
-    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Tensor, chosen: Tensor
-) -> Float[Tensor, " n"]:
+def _measured(footage: Footage, frame: Frame, chosen: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Return the height of the matte's border above some triangles in one frame; NaN where the frame does not tell."""
-    camera = sequence.tracking.cameras[frame.camera]
-    matte = torch.from_numpy(sequence.capture.mattes[frame[1:]].astype(np.float32)) / 255
+    vertices, faces, camera = footage.vertices(frame), footage.face_model.faces, footage.camera(frame)
+    matte = torch.from_numpy(footage.matte(frame).astype(np.float32)) / 255
     empty = rasterize_mesh(vertices, faces, camera).face_index < 0
     middles, _, normals = (values[chosen] for values in triangle_geometry(vertices, faces))
     cosine = (normals * normalize(camera.position - middles, dim=-1)).sum(-1)

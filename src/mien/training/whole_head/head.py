@@ -21,9 +21,8 @@ from mien.face.params import FaceParams
 from mien.render.rendering import Rendering
 from mien.training.footage.coverage import Coverage, measure_coverage
 from mien.training.footage.filmed import with_shown_angles
-from mien.training.footage.frames import COVER, SIDE_VIEW, BatchFrame, Frame, random_at
+from mien.training.footage.frames import COVER, SIDE_VIEW, BatchFrame, Footage, random_at
 from mien.training.footage.hidden import inside_triangles
-from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.contribution import prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
@@ -49,14 +48,9 @@ class WholeHead:
         interior: Float[Tensor, "f 3"] | None,
         coverage: Coverage | None,
     ):
-        """Take what the training pictures show, on the device of the avatar.
+        """Take what the pictures show, and the colours of a mouth that is filled, on the device of the avatar.
 
-        Args:
-            avatar: An avatar whose Gaussians are bound to a surface, on its device.
-            unseen: What the pictures show. None if nothing is closed or limited.
-            settings: The settings of the run.
-            interior: Colours of triangles with which the inside of the mouth is filled. None if it is not.
-            coverage: What was measured of the pictures.
+        `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled.
         """
         surface = avatar.surface()
         assert surface is not None
@@ -90,9 +84,7 @@ class WholeHead:
     ) -> None:
         """Fill the mouth if it is due, and begin a side view if one of the frames is due for it.
 
-        Args:
-            batch: The frames of the step.
-            meanwhile: Lets another thread call a function, and returns what waits for its result.
+        `meanwhile` lets another thread call a function, and returns what waits for its result.
         """
         for one in batch if self._interior is not None else ():
             fill_interior(self._surface, self._avatar.face_model, self._interior, one.number, self._settings.steps)
@@ -161,24 +153,19 @@ class WholeHead:
 
 
 def prepare_whole_head(
-    avatar: Avatar,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    settings: TrainSettings,
+    avatar: Avatar, footage: Footage, settings: TrainSettings
 ) -> Callable[[Tensor], WholeHead] | None:
     """Look at the training pictures, and close the avatar's surface where none shows it, if it is asked for.
 
-    Returns:
-        A function that makes the whole head on the device of a tensor, once the avatar is there. None for avatars
-        whose Gaussians are bound to no surface.
+    Returns a function that makes the whole head on the device of a tensor, once the avatar is there. It is None for
+    avatars whose Gaussians are bound to no surface.
     """
     surface, model = avatar.surface(), avatar.face_model
     if surface is None:
         return None
-    filled, unseen, coverage, interior = fills_sides(frames, settings, bound=True), None, None, None
+    filled, unseen, coverage, interior = fills_sides(footage.frames, settings, bound=True), None, None, None
     if filled or surface.limited:
-        unseen = unseen_of(avatar, sequences, faces, frames, filled=filled)
+        unseen = unseen_of(avatar, footage, filled=filled)
         surface.close(unseen.prior)
         coverage = unseen.coverage
     if filled and coverage is not None:
@@ -186,7 +173,7 @@ def prepare_whole_head(
         assert avatar.filmed is not None
         avatar.filmed = with_shown_angles(avatar.filmed, model, neutral, coverage)
     if settings.inside == "filled":
-        coverage = coverage or measure_coverage(model, sequences, faces, frames)
+        coverage = coverage or measure_coverage(footage)
         interior = interior_colors(avatar, coverage)
 
     def make(like: Tensor) -> WholeHead:

@@ -109,12 +109,8 @@ class SideViews:
     def drawn(self, face: FaceParams, camera: Camera, step: int, random: torch.Generator) -> Callable[[], SideView]:
         """A function that makes the side view of a step. It does not depend on the avatar, and any thread may call it.
 
-        Args:
-            face: One timestep, on any device. Its joints and its place are kept, and its expression is that of views
-                from the side.
-            camera: The camera in front of the head.
-            step: The step, which says whether the head is turned or the expression raised.
-            random: Draws the angle and the coefficients.
+        The joints and the place of a face are kept, and so is its expression in views from the side. The step says
+        whether the head is turned or the expression raised.
         """
         raised = step % _SIDE_VIEWS_EVERY != 0
         angle = _drawn_angle(raised, random)
@@ -131,13 +127,7 @@ class SideViews:
         return partial(self._made, SideViewPlan(face, raised, small, background, posed, up))
 
     def loss(self, avatar: Avatar, view: SideView, progress: Progress) -> Float[Tensor, ""]:
-        """The weighted difference between the avatar and the completed mesh in one side view.
-
-        Args:
-            avatar: The avatar, on the device of the view's face.
-            view: The view.
-            progress: How far training is.
-        """
+        """The weighted difference between the avatar and the completed mesh in one side view."""
         plan, like = view.plan, view.plan.face.expression
         posed = avatar.pose(plan.face, progress)
         seen = rasterize(posed.gaussians.timestep(0), plan.camera, plan.background.to(like))
@@ -178,13 +168,9 @@ class SideViews:
 def side_views(
     face_model: FaceModel, weight: float, colors: Float[Tensor, "f 3"], height: Float[Tensor, " f"]
 ) -> SideViews:
-    """The side views of a head.
+    """The side views of a head with completed colours, 0..1, and heights of the surface above triangles, in metres.
 
-    Args:
-        face_model: The face model, on the CPU in float32.
-        weight: Weight of the loss.
-        colors: Completed colours of the triangles, 0..1.
-        height: Height of the surface above each triangle, in metres, which is that of fills.
+    All is on the CPU in float32.
     """
     parts, over = head_parts(face_model), _at_vertices(face_model, height)
     compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)

@@ -9,7 +9,6 @@ because the hair above them is on the outline.
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -22,14 +21,12 @@ from mien.avatar.density import DensityControl, GradientDensity
 from mien.avatar.settings import Photometric
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
-from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.render.rendering import Rendering
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
-from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.hidden import hidden_triangles
-from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.back_hair import back_hair
 from mien.training.whole_head.completion import complete_colors, vertex_means
@@ -136,16 +133,12 @@ def spare_fills(surface: BoundSurface, density: DensityControl, unseen: Unseen) 
 
 
 @torch.no_grad()
-def unseen_of(
-    avatar: Avatar, sequences: Items[Sequence], faces: Items[FaceParams], frames: Items[Frame], *, filled: bool
-) -> Unseen:
-    """What some frames show of an avatar's head. The avatar is on the CPU, in float32."""
-    model = avatar.face_model
-    hair = hair_height(model, sequences, faces, frames)
-    hanging = hanging_hair(model, sequences, faces, frames)
+def unseen_of(avatar: Avatar, footage: Footage, *, filled: bool) -> Unseen:
+    """What the frames show of an avatar's head. The avatar is on the CPU, in float32."""
+    model, hair, hanging = avatar.face_model, hair_height(footage), hanging_hair(footage)
     if not filled:
         return Unseen(None, SurfacePrior(hair, hanging))
-    found = measure_coverage(model, sequences, faces, frames)
+    found = measure_coverage(footage)
     neutral = model.head_vertices(avatar.subject)[0].detach()
     parts = head_parts(model)
     # The mesh cannot say exactly which part of a mouth a picture shows, so no colour from there is believed.
@@ -156,12 +149,14 @@ def unseen_of(
     filled_in = (shown < UNSEEN_CONFIDENCE) & (found.above > 0.5)
     outside = (found.above > 0.5) & ~parts.interior
     behind_head = back_hair(model, neutral, hair, hanging)
-    drawn = drawn_at_height(model, torch.maximum(hair, behind_head), sequences, faces, frames)
+    drawn = drawn_at_height(footage, torch.maximum(hair, behind_head))
     filled_in &= ~(outside & beside_shown(model, neutral, outside & (drawn | ~filled_in)))
-    filled_in |= hidden_inside(model, parts.interior, sequences, faces, frames)
+    filled_in |= hidden_inside(footage, parts.interior)
     widening = wider_where_faces_move(model, neutral, parts.interior)
     behind = filled_in & (behind_head > hair)
-    colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
+    # The colours of the scalp go on over triangles behind hanging hair.
+    of_hair = Surface.of(neutral, model.faces).spread(colors, parts.scalp.to(colors), parts.scalp | behind)
+    colors = torch.where(behind[:, None], of_hair, colors)
     hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
     strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_LEAST_HEIGHT)
     return Unseen(
@@ -169,35 +164,24 @@ def unseen_of(
     )
 
 
-def drawn_at_height(
-    face_model: FaceModel,
-    height: Float[Tensor, " f"],
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-) -> Bool[Tensor, " f"]:
+def drawn_at_height(footage: Footage, height: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
     """Which triangles are in front somewhere in the head of some picture if the mesh is as high as the hair.
 
-    Args:
-        face_model: The face model.
-        height: Height of hair above each triangle, in metres.
-        sequences: The sequences that the frames count in.
-        faces: Face parameters of each sequence.
-        frames: The frames to look at. Some of them are used, evenly spread.
+    Heights are in metres. Some of the frames are used, evenly spread.
     """
-    over = vertex_means(face_model, height[:, None].expand(-1, 3))[:, 0]
+    faces, over = footage.face_model.faces, vertex_means(footage.face_model, height[:, None].expand(-1, 3))[:, 0]
 
     def drawn_in(frame: Frame) -> Bool[Tensor, " f"]:
-        sequence, vertices = sequences[frame.sequence], face_model(faces[frame.sequence][frame.timestep])[0]
-        raised = vertices + over[:, None] * vertex_normals(vertices, face_model.faces)
-        index = rasterize_mesh(raised, face_model.faces, sequence.tracking.cameras[frame.camera]).face_index
-        head = torch.from_numpy(np.array(sequence.scoring[frame[1:]])) > 127
-        drawn = torch.zeros(len(face_model.faces), dtype=torch.bool)
+        vertices = footage.vertices(frame)
+        raised = vertices + over[:, None] * vertex_normals(vertices, faces)
+        index = rasterize_mesh(raised, faces, footage.camera(frame)).face_index
+        head = torch.from_numpy(footage.scoring(frame)) > 127
+        drawn = torch.zeros(len(faces), dtype=torch.bool)
         drawn[index[head & (index >= 0)].long()] = True
         return drawn
 
-    result = torch.zeros(len(face_model.faces), dtype=torch.bool)
-    for drawn in stream_in_threads(drawn_in, spread_frames(frames, _HEIGHT_FRAMES)):
+    result = torch.zeros(len(faces), dtype=torch.bool)
+    for drawn in stream_in_threads(drawn_in, spread_frames(footage.frames, _HEIGHT_FRAMES)):
         result |= drawn
     return result
 
@@ -207,10 +191,7 @@ def beside_shown(
 ) -> Bool[Tensor, " f"]:
     """Which triangles are so near to those that pictures show that hair above them is on the outline of some picture.
 
-    Args:
-        face_model: The face model.
-        vertices: The person's neutral head in the head frame, in metres.
-        shown: Triangles of the outside that pictures show.
+    The vertices are those of the neutral head, in metres.
     """
     if not bool(shown.any()):
         return torch.zeros_like(shown)
@@ -219,26 +200,12 @@ def beside_shown(
     return apart < OUTLINE_BAND
 
 
-def _hair_colors(
-    face_model: FaceModel,
-    vertices: Float[Tensor, "v 3"],
-    scalp: Bool[Tensor, " f"],
-    behind: Bool[Tensor, " f"],
-    colors: Float[Tensor, "f 3"],
-) -> Float[Tensor, "f 3"]:
-    """Colours in which those of the scalp go on over triangles behind hanging hair."""
-    return Surface.of(vertices, face_model.faces).spread(colors, scalp.to(colors), scalp | behind)
-
-
 def wider_where_faces_move(
     face_model: FaceModel, vertices: Float[Tensor, "v 3"], interior: Bool[Tensor, " f"]
 ) -> Float[Tensor, " f"]:
     """Factors on the limits to the surface: above 1 at and around lips and lids, and inside the mouth.
 
-    Args:
-        face_model: The face model.
-        vertices: The person's neutral head in the head frame, in metres.
-        interior: Triangles inside the mouth.
+    The vertices are those of the neutral head, in metres.
     """
     middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
     if not bool(moving.any()):
@@ -249,21 +216,14 @@ def wider_where_faces_move(
     return 1 + (_MOVING_WIDENING - 1) * torch.where(interior, 1.0, near)
 
 
-def hidden_inside(
-    face_model: FaceModel,
-    interior: Bool[Tensor, " f"],
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-) -> Bool[Tensor, " f"]:
+def hidden_inside(footage: Footage, interior: Bool[Tensor, " f"]) -> Bool[Tensor, " f"]:
     """Which triangles inside a mouth hardly any picture shows, because lips, cheeks or tongue are in front of them."""
 
     def shown_in(frame: Frame) -> Bool[Tensor, " f"]:
-        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
-        camera = sequences[frame.sequence].tracking.cameras[frame.camera]
-        return interior & ~hidden_triangles(vertices, face_model, interior, camera)
+        hidden = hidden_triangles(footage.vertices(frame), footage.face_model, interior, footage.camera(frame))
+        return interior & ~hidden
 
-    looked = spread_frames(frames, _MOUTH_FRAMES)
+    looked = spread_frames(footage.frames, _MOUTH_FRAMES)
     sights = torch.zeros(len(interior))
     for shown in stream_in_threads(shown_in, looked):
         sights += shown
