@@ -9,8 +9,7 @@ from mien.avatar.gaussian_avatars.settings import as_published
 from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.point_avatar.settings import PointAvatarConfig
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, MethodConfig
+from mien.avatar.settings import FaceTuning, MethodConfig, Rate
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.training import TrainSettings
 

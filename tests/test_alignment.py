@@ -13,7 +13,7 @@ import torch
 from evaluation_case import make_experiment, two_cameras
 from mien.avatar import Avatar, neutral_of
 from mien.avatar.avatar import ParameterGroup, move_avatar
-from mien.avatar.schedules import Rate
+from mien.avatar.settings import Rate
 from mien.avatar.store import Moments
 from mien.cli import main
 from mien.commands.create import Command as Create

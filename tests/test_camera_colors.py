@@ -9,7 +9,7 @@ import torch
 
 import train_toy
 from evaluation_case import make_experiment
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.capture.quality import FrameQuality
 from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
@@ -21,12 +21,11 @@ from mien.render.rendering import Rendering
 from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces
-from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
+from mien.training.colors import CameraColors, FrameGains, frame_gains_part, lit, read_gains
 from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.footage.sequence import Sequence, Targets, composite
-from mien.training.frame_gains import FrameGains, frame_gains_part, lit, read_gains
 from mien.training.settings import AlignmentSettings
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
@@ -76,7 +75,7 @@ def drawing(size: int = 8) -> Rendering:
 @pytest.mark.unchecked
 @pytest.mark.parametrize("right", ["first", "mean"])
 def test_the_gains_are_learned_and_the_background_stays(rig, right: str, monkeypatch):
-    monkeypatch.setattr("mien.training.camera_colors.COLOR_RATE", 0.02)
+    monkeypatch.setattr("mien.training.colors.COLOR_RATE", 0.02)
     colors = colors_of(replace(SETTINGS, camera_colors=right), rig[1])
     shown, adam = drawing(), Adam()
     behind = (1 - shown.alpha[..., None]) * BACKGROUND

@@ -13,8 +13,7 @@ from mien.avatar.bound_surface import SurfacePrior
 from mien.avatar.density import GradientDensity
 from mien.avatar.methods import METHODS
 from mien.avatar.ops import surface_limits
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import Photometric
+from mien.avatar.settings import Photometric, Progress
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render import rasterize

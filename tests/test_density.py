@@ -12,8 +12,7 @@ from known import known
 from mien.adam import Moments
 from mien.avatar.avatar import Posed
 from mien.avatar.density import GradientDensity, RefillDensity, split_along_axes
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import GradientSettings, RefillSettings
+from mien.avatar.settings import GradientSettings, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering

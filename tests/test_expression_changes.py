@@ -23,7 +23,7 @@ from mien.avatar.ops.expression_changes import (
     within_seen,
 )
 from mien.avatar.ops.feature_network import Layers, feature_network_reference
-from mien.avatar.schedules import Progress, Rate
+from mien.avatar.settings import Progress, Rate
 from mien.formats.shared.packed import pack
 from mien.gaussians import Gaussians
 from mien.runtime.checks import baked_fault

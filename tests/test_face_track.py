@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import FaceTuning
+from mien.avatar.settings import FaceTuning, Progress
 from mien.face import FaceParams
 from mien.training.adam import Adam
 from mien.training.footage.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns

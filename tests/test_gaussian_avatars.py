@@ -15,7 +15,7 @@ from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gau
 from mien.avatar.ops.skin_points import blend_transforms, unskin
 from mien.avatar.ops.surface_limits import keep_on_surface, limits_of_triangles
 from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, triangle_ellipses, triangle_frames
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians, world_means

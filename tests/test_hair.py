@@ -24,8 +24,7 @@ from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Footage, Frame
 from mien.training.footage.sequence import Sequence
 from mien.training.trainer import start
-from mien.training.whole_head.back_hair import back_hair
-from mien.training.whole_head.hair_height import hair_height, hanging_hair
+from mien.training.whole_head.hair_height import back_hair, hair_height, hanging_hair
 from mien.training.whole_head.outline_fit import fit_to_outlines, fitted_faces
 from plain_settings import plain_config, plain_run
 from toy_scene import rgb_from_sh, surface_of, toy_sequence

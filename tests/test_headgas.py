@@ -22,8 +22,7 @@ from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
 from mien.avatar.ops.points import positional_encoding
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.avatar.settings import PerceptualLoss, Photometric, Progress
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.posing import head_poses

@@ -19,8 +19,7 @@ from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import write_avatar
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import GradientSettings, MethodConfig, PerceptualLoss, Photometric
+from mien.avatar.settings import GradientSettings, MethodConfig, PerceptualLoss, Photometric, Progress
 from mien.avatar.store import GaussianStore, Moments
 from mien.face import FaceModel
 from mien.formats.glb import MeshModel, read_glb_avatar, write_glb

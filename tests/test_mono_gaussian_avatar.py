@@ -15,7 +15,7 @@ from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, Attrib
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.points import at_places, positional_encoding, random_places
-from mien.avatar.schedules import Progress, Rate
+from mien.avatar.settings import Progress, Rate
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.mirror import triangle_geometry

@@ -20,8 +20,7 @@ from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
-from mien.avatar.schedules import Progress, Rate
-from mien.avatar.settings import RefillSettings
+from mien.avatar.settings import Progress, Rate, RefillSettings
 from mien.camera import Camera
 from mien.commands.parsing.settings_options import leaves
 from mien.disk.config import FRACTION, NotBelow, Range, check_ranges

@@ -22,8 +22,15 @@ from mien.render.rendering import Rendering
 from mien.training import train
 from mien.training.footage.frames import CROP, random_at
 from mien.training.footage.sequence import Sequence, Target, Targets
-from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss, person_box
-from mien.training.photometric import differentiable_ssim_map, photometric_loss, photometric_loss_reference
+from mien.training.losses import (
+    differentiable_ssim_map,
+    drawn_crop,
+    perceptual_goal,
+    perceptual_loss,
+    person_box,
+    photometric_loss,
+    photometric_loss_reference,
+)
 from mien.training.run import read_curves
 from rasterize_scenes import relative_error
 from toy_scene import toy_sequence

@@ -12,7 +12,7 @@ from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.point_avatar.avatar import PointAvatar, was_drawn
 from mien.avatar.point_avatar.networks import SurfaceNet
 from mien.avatar.point_avatar.settings import PointAvatarConfig
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.face import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians

@@ -12,8 +12,7 @@ from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import PRESETS as mono_gaussian_avatar_presets
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, Rate
 from mien.cli import main
 from mien.pipeline import train as training
 from mien.training import PRESETS, TrainSettings

@@ -13,7 +13,7 @@ from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.methods import method_named
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.camera import camera_from_fov
 from mien.cli import main
 from mien.disk.workspace import open_workspace

@@ -12,8 +12,7 @@ import train_toy
 from instruction_sets import by_threads
 from mien.adam import Moments
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.avatar.settings import PerceptualLoss, Photometric, Progress
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, train, trainer

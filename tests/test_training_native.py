@@ -27,14 +27,12 @@ from mien.avatar.ops.surface_limits import (
 )
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
-from mien.avatar.schedules import Progress, Rate
+from mien.avatar.settings import Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
 from mien.training.adam import (
     Adam,
-    FactoredAdamUpdate,
     FactoredUpdate,
     Update,
-    factored_adam_update,
     factored_update,
     factored_update_reference,
     update_all,
@@ -169,7 +167,7 @@ def published(given: Tensors, native: bool) -> Tensors:
     """Adam as published, by factors. The reference is another dtype."""
     values, first, second, *terms = (tensor.clone() for tensor in given)
     moments = Moments(first, second, torch.tensor(3.0))
-    factored_adam_update(FactoredAdamUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01))
+    factored_update(FactoredUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01))
     return [values, first, second, moments.step]
 
 

@@ -13,13 +13,12 @@ import train_toy
 from bounded_memory import MIB, allocating_at_most
 from mien import _native
 from mien.avatar.avatar import ParameterGroup, store_group
-from mien.avatar.schedules import Progress, Rate
-from mien.avatar.settings import Photometric
+from mien.avatar.settings import Photometric, Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
 from mien.render.rendering import Rendering
 from mien.training import train
 from mien.training.adam import Adam
-from mien.training.ahead import AHEAD, targets_ahead
+from mien.training.batch import AHEAD, targets_ahead
 from mien.training.footage.frames import (
     DENSITY,
     FrameOrder,
@@ -30,8 +29,7 @@ from mien.training.footage.frames import (
     training_frames,
 )
 from mien.training.footage.sequence import Sequence, Target, Targets, composite, composite_reference
-from mien.training.losses import picture_losses
-from mien.training.photometric import photometric_loss
+from mien.training.losses import photometric_loss, picture_losses
 from mien.training.settings import Split
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run

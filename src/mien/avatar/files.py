@@ -27,8 +27,6 @@ _REMEDY = "delete the run's training.json, if it is there, and train it again wi
 
 @dataclass(frozen=True)
 class _Content:
-    """Content of avatar.json."""
-
     kind: str
     """The method's name."""
     config: dict[str, Any]

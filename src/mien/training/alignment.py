@@ -28,11 +28,11 @@ from mien.face.params import FaceParams, concatenate
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
+from mien.training.colors import lit, read_gains
 from mien.training.footage.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage.frames import Frame, evenly_spread, training_frames
 from mien.training.footage.sequence import Sequence, Target, Targets
-from mien.training.frame_gains import lit, read_gains
-from mien.training.photometric import photometric_loss
+from mien.training.losses import photometric_loss
 from mien.training.run import read_face_track
 from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 from mien.training.trainer import ProgressBar, train
@@ -183,7 +183,6 @@ def align_faces(
 
 
 def _keep(folder: Path | None, track: FaceTrack, indices: list[int]) -> None:
-    """Write the parameters of timesteps that are aligned."""
     if folder is not None:
         each = [_values(track, index) for index in indices]
         write_tensors(folder / _KEPT, {name: torch.stack([values[name] for values in each]) for name in each[0]})
@@ -213,20 +212,17 @@ def _take_up(folder: Path | None, track: FaceTrack, indices: list[int]) -> int:
 
 
 def _values(track: FaceTrack, index: int) -> dict[str, Tensor]:
-    """The parameters of one timestep."""
     groups = track.parameter_groups(index)
     return {f"{group.name}.{name}": tensor for group in groups for name, tensor in group.tensors.items()}
 
 
 def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
-    """How far a step moves each field."""
     rates = (_ALIGNED_EXPRESSION, _ALIGNED_JOINTS, 1.0, _ALIGNED_SHIFT)
     own = [share * settings.rate for share in rates]
     return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
 
 
 def _batches(timesteps: list[_Timestep]) -> Iterator[list[_Timestep]]:
-    """The timesteps in parts that are drawn together."""
     for first in range(0, len(timesteps), ALIGNED_TOGETHER):
         yield timesteps[first : first + ALIGNED_TOGETHER]
 
@@ -324,7 +320,6 @@ def _moments(group: ParameterGroup, name: str) -> Moments:
 
 
 def _looked_at(index: int, sequence: Sequence, held_out_cameras: Items[str]) -> Iterator[_Timestep]:
-    """The timesteps of a sequence to align."""
     kept = [camera_id not in held_out_cameras for camera_id in sequence.capture.camera_ids]
     usable = sequence.usable() & sequence.clear() & np.array(kept)
     for timestep in range(sequence.capture.timesteps):

@@ -15,10 +15,9 @@ from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.system import peak_memory_mb
 from mien.training.adam import Adam
-from mien.training.camera_colors import CameraColors, LearnedColors
+from mien.training.colors import CameraColors, FrameGains, LearnedColors
 from mien.training.density_control.strategy import DensityStrategy
 from mien.training.footage.face_track import FaceTrack
-from mien.training.frame_gains import FrameGains
 from mien.training.whole_head.head import WholeHead
 
 _KEPT_CHECKPOINTS = 2

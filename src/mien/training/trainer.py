@@ -16,8 +16,7 @@ from mien.avatar.avatar import Avatar, Posed, move_avatar
 from mien.avatar.baking import measure_filmed
 from mien.avatar.files import load_avatar
 from mien.avatar.methods import method_named, method_of
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import FaceTuning, MethodConfig
+from mien.avatar.settings import FaceTuning, MethodConfig, Progress
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -31,7 +30,6 @@ from mien.perceptual.features import load_training_features
 from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
 from mien.training.adam import Adam
-from mien.training.ahead import targets_ahead
 from mien.training.batch import (
     TrainingData,
     coarse_steps,
@@ -41,9 +39,10 @@ from mien.training.batch import (
     face_groups,
     next_batch,
     seen,
+    targets_ahead,
 )
-from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
+from mien.training.colors import camera_colors, frame_gains
 from mien.training.density_control import density_strategy
 from mien.training.footage.coverage import measure_coverage, representative_frames
 from mien.training.footage.face_track import FaceTrack, turns_from_mean
@@ -59,7 +58,6 @@ from mien.training.footage.frames import (
 )
 from mien.training.footage.mesh_colors import vertex_colors
 from mien.training.footage.sequence import Sequence, Targets
-from mien.training.frame_gains import frame_gains
 from mien.training.losses import train_psnr
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
 from mien.training.settings import TrainSettings, resolved
@@ -193,7 +191,6 @@ def pretrain(
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
-    """Check that training has not diverged, before anything is written."""
     for name, tensor in state.avatar.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise _diverged(run_dir, state, f"{name} is not finite")
@@ -361,7 +358,6 @@ def _after_update(
 
 
 def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: float, step_ms: float) -> str:
-    """Add an entry to the curves, and return a text for the progress bar."""
     entry = {name: float(value.detach()) for name, value in losses.items()}
     rare = [] if state.head is None else [*state.head.rare_losses]
     rare += ["perceptual"] if state.avatar.config.photometric.perceptual.weight > 0 else []

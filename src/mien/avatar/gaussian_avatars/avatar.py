@@ -15,13 +15,12 @@ from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_grou
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.density import GradientDensity
-from mien.avatar.gaussian_avatars.changes import BASES, change_penalties
-from mien.avatar.gaussian_avatars.feature_appearance import FeatureAppearance, feature_tensors
+from mien.avatar.gaussian_avatars.changes import BASES, FeatureAppearance, change_penalties, feature_tensors
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
 from mien.avatar.ops.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.ops.triangle_penalties import triangle_penalties
-from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
+from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -114,7 +113,6 @@ class GaussianAvatars(Avatar):
 
     @property
     def _changes(self) -> bool:
-        """Whether Gaussians change with the expression beside the mesh."""
         return bool(self._basis_shapes()) or self.config.appearance == "features"
 
     @property
@@ -156,10 +154,6 @@ class GaussianAvatars(Avatar):
             groups += self.appearance.parameter_groups(self.store)
         return groups
 
-    def gaussian_store(self) -> GaussianStore:
-        """Every per-Gaussian tensor."""
-        return self.store
-
     def density(self) -> GradientDensity:
         """Gradient-based control. Children stay on their parent's triangle; no triangle loses its last Gaussian."""
         return GradientDensity(
@@ -184,7 +178,6 @@ class GaussianAvatars(Avatar):
         )
 
     def _bake_changes(self) -> ExpressionChanges | None:
-        """The changes with the expression, or None if the settings ask for none."""
         if not self._changes:
             return None
         features = None if self.appearance is None else self.appearance.bake(self.store)
@@ -205,7 +198,6 @@ class GaussianAvatars(Avatar):
         return "head" if self.config.sh_degree == 0 else self.config.sh_frame
 
     def _active_sh(self, progress: Progress) -> Float[Tensor, "n k 3"]:
-        """SH coefficients up to the degree that is active."""
         degree = self.config.sh_degree
         if degree == 0:
             return self.store["sh_constant"]

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from mien.avatar.schedules import Rate
 from mien.avatar.settings import (
     Differences,
     FaceTuning,
@@ -11,6 +10,7 @@ from mien.avatar.settings import (
     MethodConfig,
     PerceptualLoss,
     Photometric,
+    Rate,
 )
 from mien.disk.config import FRACTION, NOT_NEGATIVE, NotBelow, Range, overlay
 

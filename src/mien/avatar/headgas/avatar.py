@@ -42,7 +42,7 @@ from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.expression_changes import expression_inputs, principal_directions
 from mien.avatar.ops.feature_network import Layers, feature_network
 from mien.avatar.ops.points import positional_encoding, sample_surface
-from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
+from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.errors import UserError
 from mien.face.model import FaceModel
@@ -143,10 +143,6 @@ class HeadGas(Avatar):
         network = network_group("network", self.network, config.network_rate)
         return [*groups, replace(network, epsilon=config.network_epsilon)]
 
-    def gaussian_store(self) -> GaussianStore:
-        """Every per-Gaussian tensor."""
-        return self.store
-
     def density(self) -> GradientDensity:
         """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
         return GradientDensity(self.config.density, opacity_logits=None, judged_opacities=self.judged_opacities)
@@ -189,7 +185,6 @@ class HeadGas(Avatar):
         return Static(store["means"], attributes, names, free, network=network)
 
     def _baked_features(self) -> tuple[Float[Tensor, "n w"], FeatureDirections]:
-        """A network's first columns for the person at rest, and what the face adds to them."""
         rest, directions = as_array(self.rest), as_array(self.directions)
         if "bases" in self.store.names():
             return self.store["neutral_features"], FeatureDirections(rest, directions, as_array(self.store["bases"]))

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import EPSILON_RANGE, Differences, FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import EPSILON_RANGE, Differences, FaceTuning, GradientSettings, MethodConfig, Rate
 from mien.disk.config import FRACTION, NOT_NEGATIVE, Range, ToLoad
 
 Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from mien.avatar.avatar import Posed
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.ops.feature_network import SLOPE, Layers, blended_features
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.gaussians import Gaussians
 from mien.rotation import multiply_quaternions
 

@@ -35,8 +35,7 @@ from mien.avatar.mono_gaussian_avatar.networks import (
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, MonoGaussianAvatarConfig
 from mien.avatar.ops.activation import sigmoid
-from mien.avatar.schedules import TRAINED, Progress
-from mien.avatar.settings import RefillSettings
+from mien.avatar.settings import TRAINED, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -106,10 +105,6 @@ class MonoGaussianAvatar(FreePoints):
             groups.append(store_group(self.store, "own_attributes", self.config.own_rate))
         groups += [network_group(name, network, rate) for name, network in networks.items()]
         return [replace(group, halvings=halvings, epsilon=self.config.adam_epsilon) for group in groups]
-
-    def gaussian_store(self) -> GaussianStore:
-        """The store of points. Everything else comes from networks."""
-        return self.store
 
     def density(self) -> RefillDensity:
         """Deletes points that no view of the last epoch has shown, then refills up to the scheduled number."""

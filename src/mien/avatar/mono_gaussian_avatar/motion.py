@@ -21,8 +21,7 @@ from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.points import at_places, random_places, sample_surface
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
-from mien.avatar.schedules import Progress
-from mien.avatar.store import GaussianStore
+from mien.avatar.settings import Progress
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform
@@ -63,7 +62,6 @@ class FreePoints(Avatar, ABC):
 
     config: Any
     """`MonoGaussianAvatarConfig`, or `PointAvatarConfig`, which has the same names for what is used here."""
-    store: GaussianStore
     deformation: DeformationNet
     canonical_expression: Tensor
     canonical_joints: Tensor
@@ -248,7 +246,6 @@ def _pose_features(face: FaceParams) -> Float[Tensor, "b p"]:
 
 
 def _inverse(pose: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
-    """The inverses of rigid transforms."""
     turned = pose[:, :3, :3].transpose(1, 2)
     return rigid_transform(turned, -(turned @ pose[:, :3, 3:])[..., 0])
 

@@ -175,7 +175,6 @@ class AttributeChangeNet(nn.Module):
 
 
 def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:
-    """Layers with the same input as one."""
     return Layer(torch.cat([layer.weight for layer in layers]), torch.cat([layer.bias for layer in layers]), activation)
 
 

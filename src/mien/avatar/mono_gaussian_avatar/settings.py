@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
+from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric, Rate
 from mien.disk.config import NOT_NEGATIVE, Above, Range, ToLoad
 
 LENGTH_UNIT = 0.25

@@ -89,7 +89,6 @@ def _evenly_drawn(
 def _places(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], triangles: Int[Tensor, " n"], random: torch.Generator
 ) -> Float[Tensor, "n 3"]:
-    """A random point on each of the triangles."""
     share = torch.rand(len(triangles), 2, generator=random)
     share = torch.where(share.sum(1, keepdim=True) > 1, 1 - share, share)
     weights = torch.cat([1 - share.sum(1, keepdim=True), share], dim=1)
@@ -99,5 +98,4 @@ def _places(
 def _to_triangles(
     frames: TriangleFrames, triangles: Int[Tensor, " n"], vectors: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Vectors of the head frame in the axes of their triangles."""
     return torch.einsum("nji,nj->ni", frames.R[triangles], vectors)

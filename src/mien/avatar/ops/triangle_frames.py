@@ -144,8 +144,6 @@ def rig_topology(vertex_count: int, faces: Int[Tensor, "f 3"], face_index: Int[T
 
 @dataclass(frozen=True, eq=False)
 class _Topology:
-    """A topology, with the tensors that it was made from and their versions."""
-
     topology: _native.RigTopology
     vertex_count: int
     faces: Tensor

@@ -36,8 +36,7 @@ from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.skin_points import blend_transforms
 from mien.avatar.point_avatar.networks import ShadingNet, SurfaceNet
 from mien.avatar.point_avatar.settings import PointAvatarConfig
-from mien.avatar.schedules import TRAINED, Progress
-from mien.avatar.settings import RefillSettings
+from mien.avatar.settings import TRAINED, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.errors import UserError
 from mien.face.model import FaceModel
@@ -110,10 +109,6 @@ class PointAvatar(FreePoints):
         networks = {"surface": self.surface_net, "deformation": self.deformation, "shading": self.shading}
         groups = [network_group(name, network, self.config.network_rate) for name, network in networks.items()]
         return [store_group(self.store, "means", self.config.means_rate), *groups]
-
-    def gaussian_store(self) -> GaussianStore:
-        """The store of points. Everything else comes from networks."""
-        return self.store
 
     def density(self) -> RefillDensity:
         """Deletes points that no picture of the last epoch showed, then refills up to the scheduled number."""

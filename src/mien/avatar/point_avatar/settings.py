@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
+from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric, Rate
 from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)

@@ -28,7 +28,7 @@ from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
 from mien.avatar.ops.triangle_frames import corners_in_frames, ellipses_of_corners, triangle_frames
-from mien.avatar.schedules import TRAINED, Progress
+from mien.avatar.settings import TRAINED, Progress
 from mien.avatar.store import GaussianStore
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
@@ -122,10 +122,6 @@ class TexturedMesh(Avatar):
             ParameterGroup("light", {"light": self.light}, config.light_rate),
         ]
 
-    def gaussian_store(self) -> GaussianStore:
-        """Every per-surfel tensor."""
-        return self.store
-
     def density(self) -> None:
         """The surfels stay where they are."""
 
@@ -174,7 +170,6 @@ class TexturedMesh(Avatar):
         return _AtRest(offsets, vertex_albedo, albedo, local, colors)
 
     def _surfels(self) -> Surfels:
-        """The places of the surfels of the store."""
         return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
 
     def _moved_subject(self, offsets: Float[Tensor, "v 3"]) -> FaceParams:
@@ -190,7 +185,6 @@ class TexturedMesh(Avatar):
         return offsets * self.get_buffer("movable"), albedo
 
     def _world_colors(self, face: FaceParams, albedo: Float[Tensor, "n 3"]) -> Float[Tensor, "b n 3"]:
-        """Colours under light that stands still in the world."""
         normals = self._normals(self.face_model.head_vertices(face))
         return albedo * shade(normals @ head_poses(face)[:, :3, :3].transpose(1, 2), self.light)
 

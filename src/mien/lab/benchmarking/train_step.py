@@ -23,7 +23,7 @@ from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
 from mien.render import rasterize
 from mien.tracking.tracking import Tracking
-from mien.training.ahead import targets_ahead
+from mien.training.batch import targets_ahead
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Sequence, Targets

@@ -34,7 +34,7 @@ from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.avatar.avatar import Posed
 from mien.avatar.density import GradientDensity
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
@@ -89,7 +89,6 @@ class GradientStrategy(DensityStrategy):
 
     @property
     def _resets(self) -> tuple[float, ...]:
-        """The times at which opacities are lowered, as fractions of the run."""
         settings = self._density.settings
         return () if "reset_opacities" in settings.rules_off else settings.opacity_resets
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mien.avatar.avatar import Posed
 from mien.avatar.density import RefillDensity
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mien.avatar.avatar import Posed
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.avatar import ParameterGroup
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning
+from mien.avatar.settings import FaceTuning, Rate
 from mien.avatar.store import Moments
 from mien.face.params import FaceParams
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
@@ -25,8 +24,6 @@ _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """One timestep of a track."""
-
     face: FaceParams
     groups: list[ParameterGroup]
 

@@ -26,61 +26,49 @@ class TrainSettings:
     """Number of training frames, one for each optimiser step. All schedules stretch with it. A method may use several
     frames in one optimiser step, which then counts as so many."""
     split: Split = "blocks"
-    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
-    gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08.
-    nersemble-benchmark is that of the benchmark: four sequences, and all cameras but the frontal one. dataset is the
-    split of an imported dataset's authors (docs/datasets.md)."""
+    """What is held out (`mien.training.settings.splits`)."""
     background: Literal["white", "mixed", "random", "auto"] = "auto"
-    """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
-    which can show as white dots from the side and white needles in new poses. It costs 0.2 to 0.6 dB compared with
-    white. Mixed is random in one of ten steps and white in the others: it costs next to nothing, ears and hair
-    stay clean, and cheeks nearly so. Auto: mixed where sides are filled (`--training.unseen`), else white."""
+    """Background of the training pictures. A random colour in each step keeps Gaussians from imitating white, which can
+    show as white dots and needles; it costs 0.2 to 0.6 dB. Mixed, random in one of ten steps, costs next to nothing.
+    Auto: mixed where sides are filled (`--training.unseen`), else white."""
     edges: Literal["filmed", "cleaned", "auto"] = "auto"
-    """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
-    avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
-    backgrounds. Cleaned: the colours of the person alone, as estimated from what is solid nearby. Auto: cleaned where
-    sides are filled (`--training.unseen`), else filmed."""
+    """Colours at soft edges of the matte, where a pixel holds some of the filmed background: as they are, which can
+    show as slivers over other backgrounds (filmed), or those of the person alone, as estimated (cleaned). Auto: cleaned
+    where sides are filled (`--training.unseen`), else filmed."""
     frame_order: Literal["even", "rare"] = "even"
     """How often frames are drawn: each equally often, or those with a rare expression up to four times as often as
     those with a common one."""
     camera_colors: Literal["none", "first", "mean"] = "none"
     """Whether a change of colours is learned for each camera, for rigs whose cameras differ in exposure or white
-    balance. It is used only in training: the avatar has the colours of the first camera (first), or those between all
-    cameras (mean). A step takes longer with it."""
+    balance. The avatar has the colours of the first camera (first), or those between all cameras (mean)."""
     light: Literal["steady", "changing", "auto"] = "auto"
     """Whether a gain of three numbers is learned for each timestep, for videos whose exposure, white balance or lamps
-    change. It is used only in training and in scores: the avatar has the mean light. The gain of a held-out timestep
-    is interpolated in time from those that are trained on. Auto: changing if one camera filmed and the brightness of
-    the face changes by a factor of more than 1.35, else steady."""
+    change. The avatar has the mean light. Auto: changing if one camera filmed and the brightness of the face changes
+    by a factor of more than 1.35, else steady."""
     unseen: Literal["trained", "filled", "auto"] = "auto"
-    """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
-    broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
-    no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
-    and alpha is compared with the matte (weight 1 or more). Auto: filled if one camera filmed, trained if there are
-    several. Methods that bind no Gaussians to triangles train all sides in either case."""
+    """Sides of the head that no training picture shows. Trained: they may help to explain pictures, and look broken
+    from the side. Filled: they are a closed surface in completed colours, what is seen is kept flat on the mesh, and
+    alpha is compared with the matte. Auto: filled if one camera filmed, trained if there are several. Methods that bind
+    no Gaussians to triangles train all sides in either case."""
     mesh: Literal["tracked", "fitted", "auto"] = "auto"
-    """The mesh that Gaussians are bound to. Tracked: as tracking left it. Fitted: before training, what stands out
-    beyond the person's mattes, such as a skull above the hair or an ear that hangs too low, is drawn into them. Auto:
-    fitted where sides are filled (`--training.unseen`), where a fill would stand out like a cap or a grey lobe, else
-    tracked."""
+    """The mesh that Gaussians are bound to: as tracking left it (tracked), or drawn into the mattes where it is outside
+    of them (fitted). Auto: fitted where sides are filled (`--training.unseen`), else tracked."""
     side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
     """Weight of the views from the side and of raised expressions, in which filled heads are compared with the
     completed mesh."""
     hair_rate: Annotated[float, Range(0, 0.01)] = 6e-4
-    """Largest distance in metres by which the surface of the hair of a filled head rises or sinks in one correction,
-    where that lowers the loss. There is one after every 8 steps from 3 to 60 % of the run, and they get smaller. 0
-    keeps the hair at the height that was measured on mattes or guessed from it."""
+    """Largest distance in metres by which the surface of the hair of a filled head moves in one correction. 0 keeps it
+    at the height that was measured on mattes or guessed from it."""
     inside: Literal["free", "covered", "filled"] = "covered"
-    """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
-    them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
-    each step, so that lids and lips become opaque. Filled: also, a mouth that is hardly ever seen gets a surface in
-    dark colours at half of the run, which can show as dark spots on cheeks from the side. Methods that bind no
-    Gaussians to triangles have no such Gaussians."""
+    """Eyeballs and the inside of the mouth. Free: they may help to explain lids, lips and cheeks that hide them, and
+    are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in each step, so
+    that lids and lips become opaque. Filled: also, a mouth that is hardly ever seen gets a dark surface at half of the
+    run, which can show as dark spots on cheeks from the side."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     coarse: Annotated[float, FRACTION] = 0.0
-    """Share of the run, from its start, that trains on pictures of half that size. Such steps take less time, and
-    details get a little softer. Pictures whose longer side has fewer than 384 pixels are not halved."""
+    """Share of the run, from its start, that trains on pictures of half that size, which takes less time. Pictures
+    whose longer side has fewer than 384 pixels are not halved."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
     device: DeviceName = "cpu"

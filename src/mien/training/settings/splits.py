@@ -132,7 +132,6 @@ def _blocks(count: int, folder: Path | None) -> Sequence[tuple[int, int]]:
 
 
 def _tail(count: int, folder: Path | None) -> Sequence[tuple[int, int]]:
-    """The last 20 %, which may show things that were never seen."""
     return [(count - round(0.2 * count), count)]
 
 
@@ -261,7 +260,6 @@ def driving_sequences(names: Sequence[str]) -> list[str]:
 
 
 def _key(name: str) -> str:
-    """The id in a sequence's name, or an empty text."""
     match = _ID.search(name)
     if match is None:
         return ""

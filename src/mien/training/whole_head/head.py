@@ -14,8 +14,7 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Posed
 from mien.avatar.density import DensityControl
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import Photometric
+from mien.avatar.settings import Photometric, Progress
 from mien.camera import Camera
 from mien.face.params import FaceParams
 from mien.render.rendering import Rendering
@@ -143,7 +142,6 @@ class WholeHead:
             self._follow_hair()
 
     def _follow_hair(self) -> None:
-        """Let what is known of the surface follow the hair."""
         if self.hair is None or self.unseen is None:
             return
         prior = self.hair.prior()

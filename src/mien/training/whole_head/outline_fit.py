@@ -54,8 +54,6 @@ _OPAQUE = 128
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One frame, as the descent sees it."""
-
     camera: Camera
     outside: Float[Tensor, "1 1 h w"]
     """Distance of each pixel from the matte, in pixels; 0 inside."""
@@ -187,5 +185,4 @@ def _outer_vertices(face_model: FaceModel) -> Bool[Tensor, " v"]:
 
 
 def _distance(matte: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The distance of each pixel from the half opaque part of a matte, in pixels."""
     return cv2.distanceTransform((matte < _OPAQUE).astype(np.uint8), cv2.DIST_L2, 5)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Posed
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.camera import Camera
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
@@ -141,7 +141,6 @@ class SideViews:
 
     @torch.no_grad()
     def _made(self, plan: SideViewPlan) -> SideView:
-        """The view with the pictures that it is compared with."""
         camera, faces = plan.camera.to(self.colors), self.face_model.faces
         raised = plan.vertices + self.height[:, None] * vertex_normals(plan.vertices, faces)
         index = rasterize_mesh(raised, faces, camera).face_index.long()
@@ -179,7 +178,6 @@ def side_views(
 
 
 def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Tensor, " v"]:
-    """The mean value of the triangles around each vertex."""
     return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
 
 
@@ -218,7 +216,6 @@ def turned_to_side(face: FaceParams, angle: float) -> FaceParams:
 
 
 def _drawn_angle(raised: bool, random: torch.Generator) -> float:
-    """An angle to either side, in radians."""
     share, side = torch.rand(2, generator=random, dtype=torch.float64).tolist()
     aside = (_SIDE_VIEWS_LEAST_ANGLE, _SIDE_VIEWS_MOST_ANGLE)
     low, high = (0.0, _RAISED_MOST_ANGLE) if raised else aside

@@ -89,5 +89,4 @@ def opacity_shares(
 
 
 def _distances(centers: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
-    """The distance of each centre to the nearest point."""
     return torch.cat([torch.cdist(part, points).amin(1) for part in centers.split(_PART)])

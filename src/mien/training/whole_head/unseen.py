@@ -28,10 +28,8 @@ from mien.training.footage.coverage import Coverage, drawn_share, measure_covera
 from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.hidden import hidden_triangles
 from mien.training.settings import TrainSettings
-from mien.training.whole_head.back_hair import back_hair
-from mien.training.whole_head.completion import complete_colors, vertex_means
-from mien.training.whole_head.hair_height import hair_height, hanging_hair
-from mien.training.whole_head.spreading import Surface
+from mien.training.whole_head.completion import Surface, complete_colors, vertex_means
+from mien.training.whole_head.hair_height import back_hair, hair_height, hanging_hair
 
 UNSEEN_CONFIDENCE = 0.02
 """Confidence below which a triangle is made up. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90

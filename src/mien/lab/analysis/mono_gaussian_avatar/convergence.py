@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from mien.avatar.avatar import Avatar
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import crop_to, psnr
