@@ -98,8 +98,8 @@ class PerceptualLoss:
     """
 
     weight: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Weight of the distance of features. A crop counts by its share of the picture's pixels, so that the weight of one
-    pixel does not depend on the crop. The whole person (`region`) counts fully. 0 switches the loss off."""
+    """Weight of the distance of features. A crop counts by its share of the picture's pixels, the whole person
+    (`region`) fully. 0 switches the loss off."""
     start: Annotated[float, FRACTION] = 0.3
     """Time of the first step with this loss, as a fraction of the run."""
     every: Annotated[int, Range(1, 1_000)] = 8
@@ -107,10 +107,10 @@ class PerceptualLoss:
     crop: Annotated[int, Range(16, 512)] = 64
     """Side of the crops, in pixels of the training pictures. The cost grows with its square."""
     blocks: Annotated[int, Range(1, 3)] = 2
-    """Number of blocks of the network, from fine to coarse features. Each block more doubles the cost, or more."""
+    """Number of blocks of the network, from fine to coarse features. Each doubles the cost, or more."""
     region: Literal["parts", "person"] = "parts"
-    """Pixels that a step compares: a crop drawn at random around the eyes, around the mouth, or anywhere in the scoring
-    mask's box (parts), or all of that box (person), which takes many times as long."""
+    """What a step compares: a crop drawn at random around the eyes, the mouth, or anywhere in the scoring mask's box
+    (parts), or all of that box (person), which takes many times as long."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether a step of a run of `steps` has this loss."""
@@ -132,7 +132,7 @@ class Photometric:
     alpha_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the mean absolute difference between the rendering's alpha and the matte."""
     part_weight: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Additional weight of L1 and SSIM in the boxes around eyes and mouth. With 1, these pixels count twice."""
+    """Additional weight of L1 and SSIM in the boxes around eyes and mouth."""
     perceptual: PerceptualLoss = field(default_factory=PerceptualLoss)
     """A loss of trained features on small crops."""
 
@@ -163,8 +163,7 @@ class FaceTuning:
     """
 
     enabled: bool = True
-    """Whether training corrects the tracking. Held-out frames get corrections interpolated from the training frames
-    around them."""
+    """Whether training corrects the tracking. Corrections of held-out frames are interpolated."""
     expression: Annotated[float, RATE] = 1e-3
     """Learning rate of the expression coefficients, per step."""
     joints: Annotated[float, RATE] = 1e-3
@@ -176,15 +175,13 @@ class FaceTuning:
     begin: Annotated[float, FRACTION] = 0.0
     """Time up to which faces do not change, as a fraction of the run."""
     keep_mean_pose: bool = False
-    """Whether the corrections of the head's pose have a mean of zero, in the head's own frame. With one camera, heads
-    and Gaussians otherwise move away from the camera together, which shows from the side."""
+    """Whether corrections of the head's pose have a mean of zero. With one camera, heads and Gaussians otherwise move
+    away from the camera together, which shows from the side."""
     keep_turns: bool = False
-    """Whether what follows the head's turns is removed from the corrections of its pose. A head that is too deep
-    otherwise turns less, which a front camera hardly sees and which shows from the side. It is used only with one
-    camera."""
+    """Whether what follows the head's turns is removed from these corrections, with one camera. A head that is too deep
+    otherwise turns less, which shows from the side."""
     within_bounds: bool = False
-    """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may
-    stay there."""
+    """Whether expression coefficients stay within the face model's bounds, or where they were tracked."""
 
     def slowed(self, share: float) -> "FaceTuning":
         """These settings with a share of all learning rates."""
@@ -215,26 +212,22 @@ class GradientSettings:
     rounds: Annotated[int, COUNT_OR_NONE] = 16
     """Number of rounds, evenly spread from `start` to `stop`. With 0, the number of Gaussians never changes."""
     grow_gradient: Annotated[float, NOT_NEGATIVE] = 2e-4
-    """Gaussians are duplicated or split if the mean gradient with respect to their centre, in normalised device
-    coordinates, reaches this."""
+    """Mean gradient by the centre, in normalised device coordinates, from which Gaussians grow."""
     size_unit: Literal["metres", "extent"] = "metres"
-    """Unit of `split_size` and `prune_size`: metres, or the extent of the training cameras (docs/paper_preset.md)."""
+    """Unit of `split_size` and `prune_size`: metres, or the extent of the cameras (docs/paper_preset.md)."""
     split_size: Annotated[float, NOT_NEGATIVE] = 0.0025
-    """Gaussians that grow are split in two if they are larger than this, in `size_unit`, and duplicated otherwise."""
+    """Size above which Gaussians that grow are split in two, and below which they are duplicated."""
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Gaussians larger than this, in `size_unit`, are removed. This begins with the first opacity reset after
-    `start`, or at `size_start`."""
+    """Size above which Gaussians are removed, from `size_start` on."""
     prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Gaussians with a larger radius on screen than this, in pixels, are removed. This begins with the first opacity
-    reset after `start`, or at `size_start`. 0 removes none."""
+    """Radius on screen in pixels above which Gaussians are removed, from `size_start` on. 0 removes none."""
     size_start: Annotated[float | None, FRACTION] = None
-    """Time after which Gaussians are removed by their size, as a fraction of the run. If it is not given, this begins
-    with the first opacity reset after `start`."""
+    """Time after which sizes are pruned, as a fraction of the run. By default, the first opacity reset after
+    `start`."""
     opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
     """Times at which opacities are lowered, as fractions of the run."""
     max_gaussians: Annotated[int, GAUSSIAN_COUNT] = 40_000
-    """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first. Fills of sides
-    that no picture shows do not count."""
+    """Largest number of Gaussians, but for fills. Those with the largest gradients grow first."""
     rules_off: tuple[DensityRule, ...] = ()
     """Rules that are switched off (docs/settings.md)."""
 

@@ -29,48 +29,39 @@ class GaussianAvatarsConfig(MethodConfig):
     photometric: Photometric = Photometric(
         alpha_weight=0.2, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
     )
-    """Weights of the losses that compare a rendering with its target. Without the loss of alpha, a pale face is a thin
-    one before a white background. The weight of eyes and mouth and the perceptual loss take a third more time."""
+    """Losses of pictures. Without that of alpha, a pale face is a thin one before a white background."""
     face_tuning: FaceTuning = FaceTuning(keep_mean_pose=True, keep_turns=True)
-    """Whether and how fast training changes the tracked face parameters of each frame."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
-    """Degree of the spherical harmonics for view-dependent colour. Keep 0 with a single camera, because view-dependent
-    colours then absorb the head's pose."""
+    """Degree of the spherical harmonics. With a single camera, higher ones than 0 absorb the head's pose."""
     sh_frame: Literal["world", "head"] = "world"
-    """Frame in which spherical harmonics are evaluated: world, as in the paper, or head, where light turns with the
-    head."""
+    """Frame of spherical harmonics: world, as in the paper, or head, where light turns with the head."""
     sh_warmup: Annotated[float, FRACTION] = 0.3
-    """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
+    """Fraction of the run over which the degrees are switched on, one after the other."""
     first_colors: Literal["grey", "pictures"] = "grey"
-    """Colours of the Gaussians before the first step: almost grey, as in the paper's code, or their triangles' mean
-    colours in the training pictures, which takes about a second."""
+    """First colours: almost grey, as in the paper's code, or those of the training pictures, in about a second."""
     means_rate: Rate = Rate(5e-3, 5e-5)
     """Learning rate of the centres, in triangle units per step."""
     means_times_extent: bool = False
-    """Whether the learning rate of the centres is multiplied by the extent of the training cameras in metres, as in the
-    paper."""
+    """Whether this rate is multiplied by the extent of the cameras in metres, as in the paper."""
     expression_rank: Annotated[int, Range(0, 8)] = 4
-    """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say: wrinkles, or
-    shoulders that stay while the head turns. 0 is the paper's method, without such changes."""
+    """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say, such as
+    wrinkles. 0 is the paper's method."""
     expression_changes: tuple[ChangeKind, ...] = ("offset",)
-    """Which of a Gaussian's values change linearly with these activations: colour, opacity and place (offset)."""
+    """What changes linearly with these activations: a Gaussian's colour, opacity, or place (offset)."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
-    """Weight of the mean squared changes with the expression, which keeps changes small that pictures do not need."""
+    """Weight of the mean squared changes with the expression, which holds back what pictures do not need."""
     appearance: Literal["static", "features"] = "features"
-    """Whether a Gaussian's colour and opacity stay as they are, as in the paper, or also change with features that the
-    activations of the face blend and one small network reads, as in HeadGaS."""
+    """Whether colour and opacity stay as they are, as in the paper, or also change with features, as in HeadGaS."""
     appearance_directions: Annotated[int, Range(1, 64), NotBelow("expression_rank")] = 12
-    """Number of activations of the face that blend the features, with `appearance` features. The first ones are those
-    of `expression_rank`, so there are at least as many."""
+    """Number of activations that blend the features, of which those of `expression_rank` are the first."""
     appearance_features: Annotated[int, Range(1, 256)] = 16
-    """Number of features of each Gaussian, with `appearance` features."""
+    """Number of features of each Gaussian."""
     position_weight: Annotated[float, NOT_NEGATIVE] = 0.01
-    """Weight of the penalty of centres that are further from their triangle's centre than one triangle unit."""
+    """Weight of the penalty of centres further than one triangle unit from their triangle's centre."""
     scale_threshold: Annotated[float, NOT_NEGATIVE] = 0.6
     """Scale up to which a Gaussian has no penalty, in triangle units."""
     surface_limits: bool = False
-    """Whether Gaussians are kept flat on the mesh by a correction after each step, so that skin does not fall to shards
-    from the side. They always are where sides are filled (`--training.unseen`)."""
+    """Whether Gaussians are kept flat on the mesh. Where sides are filled, they always are (`--training.unseen`)."""
     density: GradientSettings = field(default_factory=lambda: GradientSettings(grow_gradient=1e-4))
     """Density control: when and where Gaussians are added and removed."""
 
