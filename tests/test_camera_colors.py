@@ -22,7 +22,7 @@ from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces
 from mien.training.checkpoint import checkpoint_files
-from mien.training.colors import CameraColors, FrameGains, frame_gains_part, lit, read_gains
+from mien.training.colors import CameraColors, FrameGains, frame_gains, lit, read_gains
 from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.footage.sequence import Sequence, Targets, composite
@@ -235,7 +235,7 @@ def in_light(sequence: Sequence, gains: np.ndarray) -> Sequence:
 
 
 def gains_of(sequence: Sequence, settings: TrainSettings = IN_BLOCKS) -> FrameGains:
-    return FrameGains([sequence], training_frames([sequence], settings), 5e-3, torch.zeros(()))
+    return FrameGains([sequence], training_frames([sequence], settings), torch.zeros(()))
 
 
 def lit_drawing(light: np.ndarray) -> tuple[Rendering, torch.Tensor]:
@@ -300,8 +300,8 @@ def test_gains_are_there_where_the_light_changes(factor, light, cameras, has):
     one = in_light(toy_sequence(timesteps=20, size=16)[1], np.linspace(1 / factor, 1, 20)[:, None].repeat(3, 1))
     frames = training_frames([one], replace(IN_BLOCKS, split="none"))
     sequence = replace(one, capture=replace(one.capture, camera_ids=tuple("ab"[:cameras])))
-    part = frame_gains_part([sequence], frames, replace(IN_BLOCKS, light=light), torch.zeros(()))
-    assert (part is not None) == has
+    gains = frame_gains([sequence], frames, replace(IN_BLOCKS, light=light), torch.zeros(()))
+    assert (gains is not None) == has
 
 
 def test_a_run_in_steady_light_keeps_no_gains(tmp_path: Path):

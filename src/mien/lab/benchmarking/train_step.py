@@ -105,6 +105,7 @@ def training_case(
     _grow(state.avatar, count)
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
+    assert state.density is not None
     state.density.load_state(empty_statistics(count))
     paint_targets(sequence, state.avatar, like)
     return state, TrainingData(order, (Targets(sequence, 0, like=like),))

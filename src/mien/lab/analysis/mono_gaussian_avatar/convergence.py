@@ -23,11 +23,11 @@ from mien.training.footage.frames import (
     FrameOrder,
     camera_extent,
     expression_rarity,
-    resolved,
     spread_frames,
     training_frames,
 )
 from mien.training.footage.sequence import Targets
+from mien.training.settings import resolved
 from mien.training.trainer import TrainingData, pretrain, start, step
 
 TIMES = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
