@@ -13,14 +13,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 
 from mien.avatar import Avatar, GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.settings import as_published
-from mien.avatar.settings import DensityRules, FaceTuning, GradientSettings
+from mien.avatar.settings import DensityRule, FaceTuning, GradientSettings
 from mien.disk.files import read_tensors
 from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit
@@ -49,9 +49,8 @@ def configs() -> dict[str, GaussianAvatarsConfig]:
     """The rows of the table."""
     base = replace(as_published(), face_tuning=TUNED, density=DENSITY)
     rows = {"all rules on": base}
-    for name in DensityRules.__dataclass_fields__:
-        rules = replace(DensityRules(), **{name: False})
-        rows[f"without {name}"] = replace(base, density=replace(DENSITY, rules=rules))
+    for name in get_args(DensityRule):
+        rows[f"without {name}"] = replace(base, density=replace(DENSITY, rules_off=(name,)))
     paper: Any = replace(PRESETS["paper"].config("gaussian_avatars"), sh_degree=0)
     paper = replace(paper, density=replace(paper.density, max_gaussians=DENSITY.max_gaussians))
     rows["paper in short"] = paper

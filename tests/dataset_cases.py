@@ -41,7 +41,7 @@ from mien.media.video import read_video_frames, write_video
 from mien.pipeline import import_dataset as import_footage
 from mien.pipeline.import_dataset import run_import_stage
 from mien.training import read_sequence
-from mien.training.splits.own import read_own_split
+from mien.training.settings.splits import read_own_split
 from shared_things import write_toy_workspace
 
 SIDE = 32

@@ -16,7 +16,7 @@ import pytest
 import dataset_scene
 import dataset_writers as writers
 from dataset_scene import Scene, draw, head_view
-from mien.training.splits.own import OwnSplit
+from mien.training.settings.splits import OwnSplit
 
 View = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Intrinsics, and the rotation and translation from the world to a camera with OpenCV's axes."""

@@ -4,7 +4,7 @@ import torch
 
 from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
-from mien.avatar.schedules import Rate
+from mien.avatar.settings import Rate
 from mien.face import FaceModel
 from mien.render.rendering import Rendering
 from plain_settings import plain_mono_gaussian_avatar

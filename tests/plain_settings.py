@@ -9,8 +9,7 @@ from mien.avatar.gaussian_avatars.settings import as_published
 from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.point_avatar.settings import PointAvatarConfig
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, MethodConfig
+from mien.avatar.settings import FaceTuning, MethodConfig, Rate
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.training import TrainSettings
 
@@ -37,11 +36,8 @@ def plain_gaussian_avatars(**changes: Any) -> GaussianAvatarsConfig:
 
 def plain_mono_gaussian_avatar(**changes: Any) -> MonoGaussianAvatarConfig:
     """Some hundred points that start on a sphere, as in the paper."""
-    rate = Rate(1e-3, begin=0.1)
     plain = MonoGaussianAvatarConfig(
-        face_tuning=FaceTuning(
-            expression=rate, joints=rate, head_rotation=rate, head_translation=Rate(3e-4, begin=0.1)
-        ),
+        face_tuning=FaceTuning(begin=0.1),
         frames_per_step=1,
         start="sphere",
         pretraining=0,

@@ -13,7 +13,7 @@ import torch
 from evaluation_case import make_experiment, two_cameras
 from mien.avatar import Avatar, neutral_of
 from mien.avatar.avatar import ParameterGroup, move_avatar
-from mien.avatar.schedules import Rate
+from mien.avatar.settings import Rate
 from mien.avatar.store import Moments
 from mien.cli import main
 from mien.commands.create import Command as Create
@@ -32,7 +32,7 @@ from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import read_tracking
 from mien.training import TrainSettings, train
 from mien.training.alignment import FaceDescent, align, align_faces, steadier
-from mien.training.alignment_settings import AlignmentSettings
+from mien.training.settings import AlignmentSettings
 from refusals import complaint, refuses
 from shared_things import write_sequence, write_toy_workspace
 from small_face_model import make_small_face_model

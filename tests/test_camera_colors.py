@@ -9,7 +9,7 @@ import torch
 
 import train_toy
 from evaluation_case import make_experiment
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.capture.quality import FrameQuality
 from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
@@ -21,13 +21,12 @@ from mien.render.rendering import Rendering
 from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.camera_colors import CameraColors
 from mien.training.checkpoint import checkpoint_files
+from mien.training.colors import CameraColors, FrameGains, frame_gains, lit, read_gains
 from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.footage.sequence import Sequence, Targets, composite
-from mien.training.frame_gains import FrameGains, frame_gains_part, lit, read_gains
+from mien.training.settings import AlignmentSettings
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
 from refusals import refuses
@@ -75,8 +74,9 @@ def drawing(size: int = 8) -> Rendering:
 
 @pytest.mark.unchecked
 @pytest.mark.parametrize("right", ["first", "mean"])
-def test_the_gains_are_learned_and_the_background_stays(rig, right: str):
-    colors = colors_of(replace(SETTINGS, camera_colors=right, camera_color_rate=0.02), rig[1])
+def test_the_gains_are_learned_and_the_background_stays(rig, right: str, monkeypatch):
+    monkeypatch.setattr("mien.training.colors.COLOR_RATE", 0.02)
+    colors = colors_of(replace(SETTINGS, camera_colors=right), rig[1])
     shown, adam = drawing(), Adam()
     behind = (1 - shown.alpha[..., None]) * BACKGROUND
     wanted = GAINS if right == "first" else GAINS / GAINS.mean(0)
@@ -109,8 +109,8 @@ def test_one_camera_is_refused_before_anything_is_written(rig, tmp_path: Path):
         train([rig[1]], rig[0], plain_gaussian_avatars(), settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     # Without the option nothing is stored.
-    parts = start([rig[1]], rig[0], plain_gaussian_avatars(), replace(SETTINGS, camera_colors="none")).parts
-    assert "colors" not in [part.name for part in parts]
+    state = start([rig[1]], rig[0], plain_gaussian_avatars(), replace(SETTINGS, camera_colors="none"))
+    assert state.camera_colors is None
 
 
 @pytest.mark.unchecked
@@ -235,7 +235,7 @@ def in_light(sequence: Sequence, gains: np.ndarray) -> Sequence:
 
 
 def gains_of(sequence: Sequence, settings: TrainSettings = IN_BLOCKS) -> FrameGains:
-    return FrameGains([sequence], training_frames([sequence], settings), 5e-3, torch.zeros(()))
+    return FrameGains([sequence], training_frames([sequence], settings), torch.zeros(()))
 
 
 def lit_drawing(light: np.ndarray) -> tuple[Rendering, torch.Tensor]:
@@ -300,8 +300,8 @@ def test_gains_are_there_where_the_light_changes(factor, light, cameras, has):
     one = in_light(toy_sequence(timesteps=20, size=16)[1], np.linspace(1 / factor, 1, 20)[:, None].repeat(3, 1))
     frames = training_frames([one], replace(IN_BLOCKS, split="none"))
     sequence = replace(one, capture=replace(one.capture, camera_ids=tuple("ab"[:cameras])))
-    part = frame_gains_part([sequence], frames, replace(IN_BLOCKS, light=light), torch.zeros(()))
-    assert (part is not None) == has
+    gains = frame_gains([sequence], frames, replace(IN_BLOCKS, light=light), torch.zeros(()))
+    assert (gains is not None) == has
 
 
 def test_a_run_in_steady_light_keeps_no_gains(tmp_path: Path):

@@ -12,8 +12,8 @@ from mien.avatar import Avatar
 from mien.avatar.bound_surface import SurfacePrior
 from mien.avatar.density import GradientDensity
 from mien.avatar.methods import METHODS
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import Photometric
+from mien.avatar.ops import surface_limits
+from mien.avatar.settings import Photometric, Progress
 from mien.face import FaceModel
 from mien.face.head_parts import head_parts
 from mien.render import rasterize
@@ -30,8 +30,9 @@ from mien.training.footage.filmed import (
     with_shown_angles,
     write_coverage,
 )
-from mien.training.footage.frames import training_frames
+from mien.training.footage.frames import Footage, training_frames
 from mien.training.footage.sequence import Sequence
+from mien.training.whole_head.head import prepare_whole_head
 from mien.training.whole_head.unseen import UNSEEN_CONFIDENCE, Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
 from refusals import refuses
@@ -49,9 +50,13 @@ def bare_avatar(toy: Toy) -> Avatar:
     return METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
 
 
+def footage_of(model: FaceModel, sequence: Sequence) -> Footage:
+    return Footage(model, [sequence], [sequence.tracking.face], training_frames([sequence], SETTINGS))
+
+
 def covered(toy: Toy) -> Coverage:
     model, sequence = toy
-    return measure_coverage(model, [sequence], [sequence.tracking.face], training_frames([sequence], SETTINGS))
+    return measure_coverage(footage_of(model, sequence))
 
 
 def facing(model: FaceModel) -> torch.Tensor:
@@ -70,7 +75,7 @@ def test_the_front_is_seen_and_not_the_back_nor_what_is_cut_off(toy: Toy) -> Non
     assert ((found.seen > 0.02) & (found.seen < 0.98)).any(), "confidence fades"
     torch.testing.assert_close(smoothstep(torch.tensor([-1.0, 0, 0.5, 1, 2])), torch.tensor([0.0, 0, 0.5, 1, 1]))
     frames = training_frames([sequence], SETTINGS)
-    threaded = measure_coverage(model, [sequence], [sequence.tracking.face], frames, threads=3)
+    threaded = measure_coverage(Footage(model, [sequence], [sequence.tracking.face], frames), threads=3)
     assert torch.equal(threaded.seen, found.seen)
     gray = replace(sequence, capture=replace(sequence.capture, images=np.full_like(sequence.capture.images, 51)))
     colors = covered((model, gray)).colors[found.seen > 0.5]
@@ -108,7 +113,7 @@ def test_what_is_behind_is_hidden_and_high_hair_is_drawn_where_the_mesh_is_not(t
 
     def drawn(height: float, given: Sequence) -> torch.Tensor:
         above = torch.where(behind, height, 0.0)
-        return drawn_at_height(model, above, [given], [given.tracking.face], training_frames([given], SETTINGS))
+        return drawn_at_height(footage_of(model, given), above)
 
     assert drawn(0.0, sequence)[facing(model) > 0.7].all()
     assert not drawn(0.0, sequence)[behind].any()
@@ -117,9 +122,7 @@ def test_what_is_behind_is_hidden_and_high_hair_is_drawn_where_the_mesh_is_not(t
 
 
 def measured(toy: Toy, avatar: Avatar) -> Unseen:
-    sequence = toy[1]
-    frames = training_frames([sequence], SETTINGS)
-    return unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
+    return unseen_of(avatar, footage_of(avatar.face_model, toy[1]), filled=True)
 
 
 def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
@@ -127,7 +130,7 @@ def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     sequence, avatar = toy[1], bare_avatar(toy)
     unseen, store = measured(toy, avatar), avatar.gaussian_store()
     surface_of(avatar).close(unseen.prior)
-    filled_in = known(unseen.filled_in(avatar))
+    filled_in = known(unseen.filled_in(surface_of(avatar)))
     assert 0 < int(filled_in.sum()) < len(filled_in)
     assert unseen.weights(Photometric(alpha_weight=0.0)).alpha_weight > 0
     behind = replace(sequence.tracking.face[0], head_rotation=torch.tensor([[0.0, 3.0, 0.0]]))
@@ -135,7 +138,7 @@ def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     rendering.image[:, :24].sum().backward()
     before = {name: gradient.clone() for name in store.trained if (gradient := store[name].grad) is not None}
     assert before["sh_constant"][filled_in].any()
-    unseen.mask_gradients(avatar, rendering)
+    unseen.mask_gradients(avatar, surface_of(avatar), rendering)
     for name, gradient in before.items():
         guarded = known(store[name].grad)
         assert torch.equal(guarded[~filled_in], gradient[~filled_in])
@@ -153,14 +156,14 @@ def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
         for tensor in network.tensors.values():
             tensor.normal_()
     unseen = measured(toy, avatar)
-    filled_in = known(unseen.filled_in(avatar))
+    filled_in = known(unseen.filled_in(surface_of(avatar)))
     gaussians = avatar.pose(sequence.tracking.face[0]).gaussians
     (gaussians.sh.sum() + gaussians.opacities.sum()).backward()
     (factored,) = (one for group in avatar.parameter_groups() for one in group.factored.values())
     rows = factored.terms[0][0]
     expected = torch.where(filled_in[:, None], 0, rows)
     assert not rows.equal(expected)
-    unseen.mask_gradients(avatar)
+    unseen.mask_gradients(avatar, surface_of(avatar))
     assert rows.equal(expected)
 
 
@@ -190,27 +193,22 @@ def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
     avatar = bare_avatar(toy)
     unseen, store = measured(toy, avatar), avatar.gaussian_store()
     surface_of(avatar).close(unseen.prior)
-    before, fills = store["opacity_logits"].sigmoid(), known(unseen.filled_in(avatar))
-    control = spare_fills(avatar, avatar.density(), unseen)
+    before, fills = store["opacity_logits"].sigmoid(), known(unseen.filled_in(surface_of(avatar)))
+    control = spare_fills(surface_of(avatar), avatar.density(), unseen)
     assert isinstance(control, GradientDensity)
     assert control.settings.max_gaussians == plain_gaussian_avatars().density.max_gaussians + int(fills.sum())
     posed = avatar.pose(toy[1].tracking.face[0])
     density_strategy(control, store).adapt(store, posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
-    opacities, filled_in = store["opacity_logits"].sigmoid(), known(unseen.filled_in(avatar))
+    opacities, filled_in = store["opacity_logits"].sigmoid(), known(unseen.filled_in(surface_of(avatar)))
     assert opacities[filled_in].equal(before[filled_in])
     assert (opacities[filled_in] > 0.69).all(), "fills have 0.97, and strands 0.7"
     assert (opacities[~filled_in] < 0.011).all()
 
 
-def test_other_methods_train_on_everything(toy: Toy) -> None:
+def test_other_methods_have_no_surface(toy: Toy) -> None:
     model, sequence = toy
     avatar = METHODS["headgas"].avatar(METHODS["headgas"].config(), model, sequence.tracking.face)
-    unseen, weights, density = measured(toy, avatar), Photometric(alpha_weight=0.0), avatar.density()
-    assert unseen.coverage is not None
-    assert unseen.filled_in(avatar) is None
-    assert unseen.weights(weights) == weights
-    assert type(spare_fills(avatar, avatar.density(), unseen)) is type(density)
-    assert avatar.surface() is None
+    assert prepare_whole_head(avatar, footage_of(model, sequence), replace(SETTINGS, unseen="filled")) is None
 
 
 def test_fills_close_the_head(toy: Toy) -> None:
@@ -247,13 +245,13 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: Toy) -> None:
     """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
     avatar, none = bare_avatar(toy), torch.zeros(len(toy[0].faces))
     hanging = 0.05 * (torch.arange(len(none)) % 2).float()
-    store, limits = avatar.gaussian_store(), plain_gaussian_avatars().surface
+    store = avatar.gaussian_store()
     with torch.no_grad():
         store["means"][:, 1] = 1e3
     surface_of(avatar).keep_to(SurfacePrior(none, hanging, None, None, none.bool()))
     bound = store["face_index"]
     height = store["means"][:, 1] * surface_of(avatar).sizes[bound]
-    torch.testing.assert_close(height, limits.depth + limits.hair_share * hanging[bound])
+    torch.testing.assert_close(height, surface_limits.DEPTH + surface_limits.HAIR_SHARE * hanging[bound])
 
 
 @pytest.mark.unchecked

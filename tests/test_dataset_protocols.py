@@ -27,7 +27,7 @@ from mien.evaluation.protocols import EvaluationSettings
 from mien.tracking.scoring_files import read_scoring, write_scoring
 from mien.training.footage.clothes import FOREIGN, packed_clothes
 from mien.training.footage.frames import Frame
-from mien.training.splits.own import OwnSplit, write_own_split
+from mien.training.settings.splits import OwnSplit, write_own_split
 from plain_settings import plain_run
 
 pytestmark = pytest.mark.unchecked

@@ -23,7 +23,7 @@ from mien.media.video import write_video
 from mien.pipeline import import_dataset as import_footage
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
-from mien.training.splits.own import OwnSplit
+from mien.training.settings.splits import OwnSplit
 from refusals import refuses
 
 

@@ -21,7 +21,7 @@ from mien.face import FaceModel
 from mien.face.models import teeth
 from mien.face.models.flame import flame_face_model, read_flame
 from mien.training.footage.clothes import clothes_mask
-from mien.training.splits.own import OwnSplit
+from mien.training.settings.splits import OwnSplit
 from refusals import refuses
 
 CHECKED = ("insta", "imavatar", "vhap, one camera")

@@ -130,7 +130,7 @@ def test_a_gpu_trains_as_the_native_core_does_and_its_run_goes_on_without_one(sc
 @pytest.mark.parametrize("device", ["float64", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """By default, with sides that are filled and features. Steps reach a correction of the hair and a prune."""
-    monkeypatch.setattr("mien.training.whole_head.part.HAIR_EVERY", 2)
+    monkeypatch.setattr("mien.training.whole_head.head.HAIR_EVERY", 2)
     corrections, correct = [], HairSurface.correct
     monkeypatch.setattr(HairSurface, "correct", lambda *given: corrections.append(correct(*given)) or corrections[-1])
     like = like_on("cuda") if device == "cuda" else torch.zeros((), dtype=torch.float64)

@@ -6,11 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from mien.avatar.schedules import Progress, Rate
-from mien.avatar.settings import FaceTuning
+from mien.avatar.settings import FaceTuning, Progress
 from mien.face import FaceParams
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns
+from mien.training.footage.face_track import FaceTrack, spread_corrections, turns_from_mean, without_turns
 from mien.training.trainer import ALIGNED_TUNING, tuning_for
 from toy_scene import toy_face, toy_sequence
 
@@ -45,7 +44,7 @@ def correct(track: FaceTrack, tracked: FaceParams, index: int, shift: torch.Tens
 
 def test_face_track_moves_only_the_timestep_that_was_used_within_its_bounds() -> None:
     start, adam = toy_face(6), Adam()
-    track = FaceTrack(start, FaceTuning(enabled=True, expression=Rate(0.01)))
+    track = FaceTrack(start, FaceTuning(enabled=True, expression=0.01))
     for step in range(4):
         face = track.face(2)
         (face.expression.sum() + face.head_translation.sum()).backward()
@@ -67,7 +66,7 @@ def test_face_track_moves_only_the_timestep_that_was_used_within_its_bounds() ->
     bounds = torch.tensor([[0.0, 1.0], [0.3, 0.4]])
     assert float(start.expression[0, 1]) < 0.3
     for within, lowest in ((True, [0.495, 0.0]), (False, None)):
-        tuning = FaceTuning(expression=Rate(0.1), within_bounds=within)
+        tuning = FaceTuning(expression=0.1, within_bounds=within)
         track = FaceTrack(start, tuning, bounds=bounds + torch.tensor([[0.495, 0.0], [0.0, 0.0]]))
         for step in range(4):
             track.face(0).expression.sum().backward()
@@ -97,7 +96,7 @@ def test_corrections_spread_within_their_sequence_and_a_held_out_one_gets_the_me
     aside = torch.zeros(3, 3)
     aside[2, 1] = torch.pi / 2
     face = still_face(3, head_rotation=aside)
-    track = FaceTrack(face, FaceTuning(enabled=True, head_translation=Rate(0.01), head_rotation=Rate(0.02)), (2, 1))
+    track = FaceTrack(face, FaceTuning(enabled=True, head_translation=0.01, head_rotation=0.02), (2, 1))
     push(track, 0, 1.0, axes=(2,))
     tuned = track.params()
     moved = torch.tensor([[0.0, 0.0, -0.01], [-0.01, 0.0, 0.0]])
@@ -110,7 +109,7 @@ def test_a_field_that_is_not_tuned_keeps_no_correction_from_the_others(still: st
     """With a rate of 0, as MonoGaussianAvatar's paper has for translations, a field takes no part in the tuning."""
     face, moving = still_face(3), "head_rotation" if still == "head_translation" else "head_translation"
     tuning = FaceTuning(enabled=True, keep_mean_pose=False, keep_turns=False)
-    tuning = replace(tuning, **{moving: Rate(0.01), still: Rate(0.0)})
+    tuning = replace(tuning, **{moving: 0.01, still: 0.0})
     track = FaceTrack(face, tuning, (2, 1))
     push(track, 0, 1.0, (2,), moving)
     tuned = track.params()
@@ -172,12 +171,12 @@ def test_aligned_faces_are_corrected_more_slowly() -> None:
     _, sequence = toy_sequence(2, 16)
     aligned = replace(sequence, tracking=replace(sequence.tracking, settings={"aligned": {"iterations": 2}}))
     both = replace(sequence, tracking=replace(sequence.tracking, cameras=tuple(sequence.tracking.cameras) * 2))
-    tuning = FaceTuning(expression=Rate(1e-3, 1e-4), head_translation=Rate(3e-4, begin=0.5), keep_turns=True)
+    tuning = FaceTuning(expression=2e-3, begin=0.5, keep_turns=True)
     assert tuning_for(tuning, [sequence, aligned]) == tuning
     assert not tuning_for(tuning, [sequence, both]).keep_turns
     slower, share = tuning_for(tuning, [aligned]), ALIGNED_TUNING
-    assert slower.expression == Rate(share * 1e-3, share * 1e-4)
-    assert slower.head_translation == Rate(share * 3e-4, begin=0.5)
+    assert slower.expression == share * 2e-3
+    assert slower.begin == 0.5
 
 
 def test_what_tells_sequences_apart_does_not_count_as_a_turn() -> None:

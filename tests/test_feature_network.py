@@ -9,10 +9,8 @@ from mien import _native
 from mien.adam import FactoredGradient, FactoredMoments, Moments
 from mien.avatar.ops.feature_network import Layers, feature_network, feature_network_reference
 from mien.training.adam import (
-    FactoredAdamUpdate,
     FactoredUpdate,
     Update,
-    factored_adam_update,
     factored_update,
     update_all,
 )
@@ -148,19 +146,19 @@ def test_terms_add_up_and_those_that_cancel_leave_everything_finite(isa: str) ->
     assert (update.moments.second >= 0).all()
 
 
-def published(dtype: torch.dtype, f: int, terms: int) -> FactoredAdamUpdate:
+def published(dtype: torch.dtype, f: int, terms: int) -> FactoredUpdate:
     """An update by Adam as published, at its fourth step."""
     one = update_of(dtype, f=f)
     n, k, _ = one.values.shape
     first, second = random(n, k, f, seed=5).to(dtype), (random(n, k, f, seed=6).square() + 0.1).to(dtype)
     more = [(random(n, f, seed=7 + t).to(dtype), random(k, seed=9 + t).to(dtype)) for t in range(terms - 1)]
-    return FactoredAdamUpdate(one.values, [*one.terms, *more], Moments(first, second, torch.tensor(3.0)), one.rate)
+    return FactoredUpdate(one.values, [*one.terms, *more], Moments(first, second, torch.tensor(3.0)), one.rate)
 
 
 def test_published_update_has_the_bits_of_adam_with_the_whole_gradient(isa: str) -> None:
     factored, whole = published(torch.float32, 19, 1), published(torch.float32, 19, 1)
     ((rows, columns),) = whole.terms
-    factored_adam_update(factored)
+    factored_update(factored)
     update_all([Update(whole.values, rows[:, None] * columns[:, None], whole.moments, whole.rate)])
     assert factored.values.equal(whole.values)
     assert all(getattr(factored.moments, n).equal(getattr(whole.moments, n)) for n in ("first", "second", "step"))

@@ -14,9 +14,8 @@ import train_toy
 from known import known
 from mien import runtime
 from mien.avatar import Avatar, load_avatar
-from mien.avatar.baking import make_portable
+from mien.avatar.baking import make_portable, measure_filmed
 from mien.avatar.files import write_avatar
-from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.cli import main

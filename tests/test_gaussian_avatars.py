@@ -10,12 +10,12 @@ from torch import Tensor
 from instruction_sets import by_threads
 from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars, never_empty_a_triangle
-from mien.avatar.gaussian_avatars.settings import SurfaceLimits
-from mien.avatar.gaussian_avatars.surface_limits import keep_on_surface, limits_of_triangles
+from mien.avatar.ops import surface_limits as limits
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians, pose_bound_gaussians_reference
 from mien.avatar.ops.skin_points import blend_transforms, unskin
+from mien.avatar.ops.surface_limits import keep_on_surface, limits_of_triangles
 from mien.avatar.ops.triangle_frames import DEGENERATE_LENGTH, bind_to_world, triangle_ellipses, triangle_frames
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians, world_means
@@ -92,29 +92,29 @@ def test_no_triangle_is_emptied() -> None:
 @pytest.mark.parametrize(("hair", "widen"), [(0.0, 1.0), (0.01, 1.0), (0.0, 2.0)])
 def test_limits_keep_gaussians_on_the_surface(hair: float, widen: float) -> None:
     torch.manual_seed(0)
-    limits, shapes = SurfaceLimits(enabled=True), {"means": (200, 3), "quats": (200, 4), "log_scales": (200, 3)}
+    shapes = {"means": (200, 3), "quats": (200, 4), "log_scales": (200, 3)}
     values = {name: torch.randn(shape) for name, shape in shapes.items()}
     store = GaussianStore(values, {"face_index": torch.arange(200) % 5})
     sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
-    table = limits_of_triangles(limits, sizes, torch.full((5,), hair), torch.full((5,), widen))
-    keep_on_surface(store, table, limits.ratio)
+    table = limits_of_triangles(sizes, torch.full((5,), hair), torch.full((5,), widen))
+    keep_on_surface(store, table)
     size = sizes[store["face_index"]]
     height, scales = store["means"][:, 1] * size, store["log_scales"].exp() * size[:, None]
-    depth, thickness = widen * limits.depth, widen * limits.thickness
-    assert (height <= depth + limits.hair_share * hair + 1e-7).all()
+    depth, thickness = widen * limits.DEPTH, widen * limits.THICKNESS
+    assert (height <= depth + limits.HAIR_SHARE * hair + 1e-7).all()
     assert (height >= -depth - 1e-7).all()
     assert (height.abs() > 0.9 * depth).any()
-    assert (scales[:, 1] <= thickness + limits.hair_thickness * hair + 1e-7).all()
+    assert (scales[:, 1] <= thickness + limits.HAIR_THICKNESS * hair + 1e-7).all()
     flat = scales[:, [0, 2]]
-    assert (flat <= limits.width + limits.hair_width * hair + 1e-7).all()
-    assert (flat.amax(1) / flat.amin(1) <= limits.ratio * 1.0001).all()
+    assert (flat <= limits.WIDTH + limits.HAIR_WIDTH * hair + 1e-7).all()
+    assert (flat.amax(1) / flat.amin(1) <= limits.RATIO * 1.0001).all()
     # Needles grow wider, and do not take the longer side with them: training cannot hold what is thinner than a pixel.
     longer = values["log_scales"].exp()[:, [0, 2]].amax(1) * size
-    torch.testing.assert_close(flat.amax(1), longer.clamp_max(limits.width + limits.hair_width * hair))
+    torch.testing.assert_close(flat.amax(1), longer.clamp_max(limits.WIDTH + limits.HAIR_WIDTH * hair))
     normal = matrix_from_quaternion(torch.nn.functional.normalize(store["quats"], dim=1))[:, 1, 1]
-    assert (normal >= math.cos(math.radians(widen * limits.tilt)) - 1e-5).all()
+    assert (normal >= math.cos(math.radians(widen * limits.TILT)) - 1e-5).all()
     before = {name: store[name].clone() for name in store.names()}
-    keep_on_surface(store, table, limits.ratio)
+    keep_on_surface(store, table)
     for name, value in before.items():
         torch.testing.assert_close(store[name], value)
 

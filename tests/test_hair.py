@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from mien.avatar.bound_surface import SurfacePrior
-from mien.avatar.gaussian_avatars.hair_strands import strand_gaussians
 from mien.avatar.methods import DEFAULT_METHOD, method_named
+from mien.avatar.ops.hair_strands import strand_gaussians
 from mien.avatar.ops.triangle_frames import frames_to_world, triangle_frames
 from mien.avatar.settings import FaceTuning
 from mien.camera import camera_from_fov
@@ -21,11 +21,10 @@ from mien.rotation import matrix_from_quaternion
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.tracking import Tracking
 from mien.training import PRESETS, TrainSettings
-from mien.training.footage.frames import Frame
+from mien.training.footage.frames import Footage, Frame
 from mien.training.footage.sequence import Sequence
 from mien.training.trainer import start
-from mien.training.whole_head.back_hair import back_hair
-from mien.training.whole_head.hair_height import hair_height, hanging_hair
+from mien.training.whole_head.hair_height import back_hair, hair_height, hanging_hair
 from mien.training.whole_head.outline_fit import fit_to_outlines, fitted_faces
 from plain_settings import plain_config, plain_run
 from toy_scene import rgb_from_sh, surface_of, toy_sequence
@@ -66,13 +65,13 @@ def _sequence(model: FaceModel, height: float, grows: torch.Tensor | None = None
 @pytest.mark.parametrize("height", [0.0, 0.012, 0.03])
 def test_the_height_of_a_scalp_that_stands_out(anny, height):
     sequence, frames = _sequence(anny, height), [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
-    found = hair_height(anny, [sequence], [sequence.tracking.face], frames, threads=1)
+    found = hair_height(Footage(anny, [sequence], [sequence.tracking.face], frames))
     middles, scalp = anny.template[anny.faces].mean(1), head_parts(anny).scalp
     assert abs(float(found[scalp & (middles[:, 1] > 0.07)].median()) - height) < 0.004
     assert abs(float(found[scalp & (middles[:, 2] < -0.06)].median()) - height) < 0.006
     assert not found[~scalp].any()
     sequence.capture.mattes[:] = 255
-    assert not hair_height(anny, [sequence], [sequence.tracking.face], frames, threads=1).any(), "no outline"
+    assert not hair_height(Footage(anny, [sequence], [sequence.tracking.face], frames)).any(), "no outline"
 
 
 @pytest.mark.unchecked
@@ -82,11 +81,11 @@ def test_hair_that_hangs_beside_the_neck(anny):
     neck = parts.neck & (middles[:, 0].abs() > 0.03)
     sequence = _sequence(anny, 0.02, neck)
     frames = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
-    found = hanging_hair(anny, [sequence], [sequence.tracking.face], frames, threads=1)
+    found = hanging_hair(Footage(anny, [sequence], [sequence.tracking.face], frames))
     sides = neck & (middles[:, 0].abs() > 0.05) & (middles[:, 1] > middles[neck, 1].median())
     assert 0.012 < float(found[sides].median()) < 0.03
     bare = _sequence(anny, 0.0)
-    without = hanging_hair(anny, [bare], [bare.tracking.face], frames, threads=1)
+    without = hanging_hair(Footage(anny, [bare], [bare.tracking.face], frames))
     assert float(without[sides].median()) < 0.004
     assert float(found[parts.face].median()) < 0.004
     assert not found[parts.scalp | parts.interior].any()
@@ -195,7 +194,7 @@ _FRAMES = [Frame(0, timestep, 0) for timestep in range(_TIMESTEPS)]
 
 
 def _fitted(model: FaceModel, sequence: Sequence) -> torch.Tensor:
-    return fit_to_outlines(model, [sequence], [sequence.tracking.face], _FRAMES, threads=1)
+    return fit_to_outlines(Footage(model, [sequence], [sequence.tracking.face], _FRAMES))
 
 
 @pytest.mark.unchecked
@@ -250,7 +249,9 @@ def test_hair_draws_nothing_and_offsets_that_tracking_found_are_kept(anny: FaceM
 def test_which_meshes_are_fitted(mesh, unseen, bound: bool, fits: bool) -> None:
     model, sequence = toy_sequence(timesteps=3, size=32)
     settings = TrainSettings(mesh=mesh, unseen=unseen)
-    faces = fitted_faces(model, [sequence], [Frame(0, 0, 0)], settings, bound=bound)
+    faces = fitted_faces(
+        Footage(model, [sequence], [sequence.tracking.face], [Frame(0, 0, 0)]), settings, bound=bound
+    )
     assert (faces is not None) is fits
 
 

@@ -24,14 +24,13 @@ from mien.render.mesh import shade
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 from mien.training import PRESETS, train
 from mien.training.footage.coverage import triangle_views
-from mien.training.footage.frames import training_frames
+from mien.training.footage.frames import Footage, training_frames
 from mien.training.footage.sequence import Sequence
-from mien.training.parts import Preparation
 from mien.training.trainer import start
 from mien.training.whole_head.completion import complete_colors, vertex_means
 from mien.training.whole_head.contribution import contributions, prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
-from mien.training.whole_head.part import prepare_whole_head
+from mien.training.whole_head.head import prepare_whole_head
 from mien.training.whole_head.unseen import Unseen
 from plain_settings import plain_run
 from test_training_resume import RESULTS
@@ -117,12 +116,11 @@ def test_limits_and_side_views_follow_the_hair():
     model, sequence = _toy_with_scalp()
     settings = replace(SETTINGS, side_weight=0.1)
     avatar = start([sequence], model, CONFIG, settings).avatar
-    faces, frames = [sequence.tracking.face], training_frames([sequence], settings)
-    given = Preparation(avatar, model, [sequence], faces, frames, settings, torch.zeros(()))
-    head = known(prepare_whole_head(given))()
-    height, scalp, state = known(head.side_views).height, head_parts(model).scalp, head.part().state()
-    head.part().load_state(state | {"shift": state["shift"] + 0.01})
-    torch.testing.assert_close(head.unseen.prior.hair[scalp], known(head.hair).start.hair[scalp] + 0.01)
+    footage = Footage(model, [sequence], [sequence.tracking.face], training_frames([sequence], settings))
+    head = known(prepare_whole_head(avatar, footage, settings))(torch.zeros(()))
+    height, scalp, state = known(head.side_views).height, head_parts(model).scalp, head.state()
+    head.load_state(state | {"shift": state["shift"] + 0.01})
+    torch.testing.assert_close(known(head.unseen).prior.hair[scalp], known(head.hair).start.hair[scalp] + 0.01)
     assert float(known(head.side_views).height.max()) > float(height.max())
 
 
@@ -152,7 +150,7 @@ def _closed_avatar(model: FaceModel) -> tuple[GaussianAvatars, tuple[FaceParams,
     avatar = method_named("gaussian_avatars").avatar(config, model, face)
     assert isinstance(avatar, GaussianAvatars)
     every = torch.ones(len(model.faces), dtype=torch.bool)
-    surface_of(avatar).fill_interior(every, 0.97, torch.full((len(model.faces), 3), 0.6))
+    surface_of(avatar).fill_interior(every, torch.full((len(model.faces), 3), 0.6))
     away = triangle_views(model.template, model.faces, torch.tensor([0.0, 0.0, 0.8])) < -0.5
     camera = camera_from_fov(0.5, 128, 128, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     return avatar, (face, camera), head_parts(model).scalp & away
@@ -188,7 +186,7 @@ def test_of_hidden_copies_one_stays_and_none_below_what_is_shown(anny):
     rows, n = back.nonzero()[:, 0], len(avatar.store)
     avatar.store.append(rows)
     avatar.store.append(rows)
-    removed = prune_hidden(avatar, _seen_from_the_front(anny), [view], close=True)
+    removed = prune_hidden(avatar, surface_of(avatar), _seen_from_the_front(anny), [view], close=True)
     assert len(removed) == n + 2 * len(rows)
     left = avatar.store["face_index"][~removed].bincount(minlength=len(anny.faces))
     assert (left == 1).all(), "no triangle is left without a Gaussian, and none has two"
@@ -198,7 +196,7 @@ def test_of_hidden_copies_one_stays_and_none_below_what_is_shown(anny):
     assert len(rows) > 20
     avatar.store.append(rows)
     avatar.store["means"].detach()[n:, 1] -= 0.01 / surface_of(avatar).sizes[rows]
-    removed = prune_hidden(avatar, _seen_from_the_front(anny), [view], close=True)
+    removed = prune_hidden(avatar, surface_of(avatar), _seen_from_the_front(anny), [view], close=True)
     assert not removed[rows].any()
     assert float(removed[n:].float().mean()) > 0.8
 
@@ -209,7 +207,7 @@ def test_what_stays_becomes_a_surface_in_completed_colors(anny, close):
     store, unseen = avatar.store, _seen_from_the_front(anny)
     store.assign("opacity_logits", torch.where(back, -3.0, 4.0))
     store.assign("offset_basis", torch.ones_like(store["offset_basis"]))
-    prune_hidden(avatar, unseen, [view], close=close)
+    prune_hidden(avatar, surface_of(avatar), unseen, [view], close=close)
     torch.testing.assert_close(rgb_from_sh(store["sh_constant"][back, 0]), torch.full((int(back.sum()), 3), _COLOR))
     height = store["means"].detach()[:, 1] * surface_of(avatar).sizes
     if not close:
@@ -229,7 +227,7 @@ def test_made_up_sides_and_the_mouth_are_left_alone(anny):
     avatar, view, back = _closed_avatar(anny)
     alone = back | head_parts(anny).interior
     avatar.store.append(alone.nonzero()[:, 0])
-    removed = prune_hidden(avatar, _seen_from_the_front(anny, back), [view], close=True)
+    removed = prune_hidden(avatar, surface_of(avatar), _seen_from_the_front(anny, back), [view], close=True)
     own = alone[avatar.store["face_index"]]
     assert not removed[own].any()
     colors = avatar.store["sh_constant"].detach()[own]

@@ -11,9 +11,7 @@ from known import known
 from mien.adam import FactoredMoments, Moments
 from mien.avatar.avatar import neutral_of
 from mien.avatar.baking import make_portable
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.avatar import (
-    SHIFT_LENGTH,
     HeadGas,
     input_directions,
     neighbor_distances,
@@ -21,10 +19,10 @@ from mien.avatar.headgas.avatar import (
     spread_out,
 )
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
-from mien.avatar.headgas.variants import MOVED, averaging_weights
+from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.avatar.ops.points import positional_encoding
+from mien.avatar.settings import PerceptualLoss, Photometric, Progress
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.posing import head_poses

@@ -32,7 +32,14 @@ from mien.runtime import load as load_portable
 from mien.training import TrainSettings, read_sequence
 from mien.training.footage.frames import training_frames
 from mien.training.run import read_curves, read_face_track
-from mien.training.splits.own import OwnSplit, read_own_split, with_own_split, write_own_split
+from mien.training.settings.splits import (
+    OwnSplit,
+    Recorded,
+    Recordings,
+    fill_in,
+    read_own_split,
+    write_own_split,
+)
 from refusals import complaint
 from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 
@@ -73,8 +80,8 @@ def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest
     told = capsys.readouterr().err.splitlines()[-1]
     assert f"the imported mesh over some pictures: {first}, and 1 more; look at it before you train" in told
     read = [read_sequence(out / "sequences" / name) for name in CLIPS]
-    splits = {sequence.name: read_own_split(sequence.folder) for sequence in read}
-    settings = with_own_split(TrainSettings(split="dataset"), splits, dict.fromkeys(CLIPS, 3))
+    splits = {sequence.name: Recorded(timesteps=3, own=read_own_split(sequence.folder)) for sequence in read}
+    settings = fill_in(TrainSettings(split="dataset"), Recordings(splits))
     assert settings.held_out_sequences == (CLIPS[1],)
     assert {frame.sequence for frame in training_frames(read, settings)} == {0}
     assert "decides what is held out" in complaint(capsys, "train", out, "--split", "dataset", "--hold-out", CLIPS[0])

@@ -15,10 +15,10 @@ from mien.face import FaceModel
 from mien.gaussians import sh_from_rgb
 from mien.render import rasterize
 from mien.training import train
-from mien.training.footage.frames import training_frames
+from mien.training.footage.frames import Footage, training_frames
 from mien.training.footage.hidden import hidden_triangles, inside_triangles
 from mien.training.footage.sequence import Sequence, Targets
-from mien.training.whole_head.mouth_interior import Inside, cover_hidden, covered_reference
+from mien.training.whole_head.mouth_interior import cover_hidden, covered_reference, fill_interior
 from mien.training.whole_head.unseen import unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
 from toy_scene import rgb_from_sh, surface_of, toy_face, toy_sequence
@@ -89,7 +89,7 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
     model, sequence = open_mouth(toy[0]) if opened else toy[0], toy[1]
     avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(), model, sequence.tracking.face)
     frames = training_frames([sequence], SETTINGS)
-    unseen = unseen_of(avatar, [sequence], [sequence.tracking.face], frames, filled=True)
+    unseen = unseen_of(avatar, Footage(model, [sequence], [sequence.tracking.face], frames), filled=True)
     prior, inside = unseen.prior, inside_triangles(model)
     assert prior.filled_in is not None
     assert prior.closed is not None
@@ -114,8 +114,8 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
     model, sequence = toy
     avatar, hidden = made(toy, degree), model.face_regions == 1
     posed = avatar.pose(sequence.tracking.face[0])
-    assert cover_hidden(posed, avatar, None, torch.Generator()) is posed
-    changed = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(3))
+    assert cover_hidden(posed, surface_of(avatar), None, torch.Generator()) is posed
+    changed = cover_hidden(posed, surface_of(avatar), hidden, torch.Generator().manual_seed(3))
     color = torch.rand(3, generator=torch.Generator().manual_seed(3))
     colors = rgb_from_sh(changed.gaussians.sh[hidden, 0])
     torch.testing.assert_close(colors, color.expand_as(colors))
@@ -132,7 +132,7 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
     # The fast disguise is the reference, with its gradients.
     sh, opacities = (getattr(posed.gaussians, name).detach().requires_grad_() for name in ("sh", "opacities"))
     posed = replace(posed, gaussians=replace(posed.gaussians, sh=sh, opacities=opacities))
-    fast = cover_hidden(posed, avatar, hidden, torch.Generator().manual_seed(3)).gaussians
+    fast = cover_hidden(posed, surface_of(avatar), hidden, torch.Generator().manual_seed(3)).gaussians
     plain = covered_reference(sh, opacities, hidden, sh_from_rgb(color))
     factors = torch.rand_like(sh), torch.rand_like(opacities)
     found = torch.autograd.grad((fast.sh, fast.opacities), (sh, opacities), factors)
@@ -149,10 +149,9 @@ def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequenc
     store.assign("opacity_logits", opaque)
     before = {name: store[name].detach().clone() for name in store.names()}
     colors = torch.tensor([0.2, 0.1, 0.1]).expand(len(inside), 3)
-    furniture = Inside(inside, colors)
-    furniture.fill_interior(surface_of(avatar), 59, 120)
+    fill_interior(surface_of(avatar), toy[0], colors, 59, 120)
     assert all(torch.equal(store[name], tensor) for name, tensor in before.items()), "it is not due"
-    furniture.fill_interior(surface_of(avatar), 60, 120)
+    fill_interior(surface_of(avatar), toy[0], colors, 60, 120)
     opened = inside.clone()
     opened[half] = False
     for name, tensor in before.items():

@@ -8,15 +8,14 @@ import torch
 from torch import Tensor
 
 from known import known
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.mono_gaussian_avatar import motion
 from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.motion import CANONICAL_JAW, canonical_face, nearest_vertices
 from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
-from mien.avatar.schedules import Progress, Rate
-from mien.avatar.surface_places import at_places, random_places
+from mien.avatar.ops.points import at_places, positional_encoding, random_places
+from mien.avatar.settings import Progress, Rate
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.mirror import triangle_geometry

@@ -20,8 +20,7 @@ from mien.tracking import write_tracking
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import training_frames
 from mien.training.settings import doubly_held_out
-from mien.training.splits.benchmark import with_benchmark_split
-from mien.training.splits.named import SEQUENCES, driving_sequences, split_by_name, with_named_split
+from mien.training.settings.splits import SEQUENCES, SPLITS, Recorded, Recordings, driving_sequences, fill_in
 from refusals import refuses
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
@@ -41,18 +40,26 @@ SUBJECTS = {
 """Subjects of table 2, with the sequence that is held out of each."""
 
 
+def given(names: Any, folder: str = "306", subject: str | None = None, cameras: Any = None) -> Recordings:
+    """Return sequences whose captures have these cameras, or were not read."""
+    ids = cameras if isinstance(cameras, dict) else dict.fromkeys(names, cameras)
+    return Recordings({name: ids[name] and Recorded(ids[name], 10) for name in names}, folder, subject)
+
+
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_table_2(subject: str) -> None:
+    rule = SPLITS["gaussian-avatars"]
     for names in (FOLDERS, (*SEQUENCES, "FREE"), tuple(f"{subject}_{name}" for name in FOLDERS)):
-        split = split_by_name(names, f"nersemble_{subject}")
-        assert split.subject == subject
-        assert SUBJECTS[subject] in split.held_out
-        assert len(split.sequences) == 10
-        assert set(split.sequences) | set(split.left_out) == set(names)
-        assert driving_sequences(split.left_out) == [name for name in names if "FREE" in name]
-        assert with_named_split(NAMED, split).held_out_sequences == (split.held_out,)
-    assert split_by_name(FOLDERS, "104", subject).subject == subject, "a given subject wins over the folder"
-    assert split_by_name(FOLDERS, "104", subject.lstrip("0")).subject == subject
+        sequences = given(names, f"nersemble_{subject}")
+        used = rule.used(sequences)
+        assert len(used) == 10
+        left_out = [name for name in names if name not in used]
+        assert driving_sequences(left_out) == [name for name in names if "FREE" in name]
+        (held,) = fill_in(NAMED, sequences).held_out_sequences
+        assert SUBJECTS[subject] in held
+    for number in (subject, subject.lstrip("0")):
+        (held,) = fill_in(NAMED, given(FOLDERS, "104", number)).held_out_sequences
+        assert SUBJECTS[subject] in held, "a given subject wins over the folder"
 
 
 def test_what_the_names_do_not_say_and_what_is_withheld_twice_is_told() -> None:
@@ -65,7 +72,7 @@ def test_what_the_names_do_not_say_and_what_is_withheld_twice_is_told() -> None:
         ((*FOLDERS, "EXP-2"), "306", None, "EXP-2-eyes and EXP-2 are both EXP-2; name one of them with --sequences"),
     ):  # fmt: skip
         with pytest.raises(UserError) as told:
-            split_by_name(names, folder, subject)
+            fill_in(NAMED, given(names, folder, subject))
         assert words in str(told.value)
         assert "\n" not in str(told.value)
     held = TrainSettings(held_out_sequences=("FREE",))
@@ -74,21 +81,21 @@ def test_what_the_names_do_not_say_and_what_is_withheld_twice_is_told() -> None:
 
 
 def test_either_name_of_the_camera_is_held_out() -> None:
-    split = split_by_name(SEQUENCES, "306")
     ids: dict[str, tuple[str, ...]] = {name: ("07", "08", "09") for name in SEQUENCES}
-    assert with_named_split(NAMED, split, ids).held_out_cameras == ("08",)
+    assert fill_in(NAMED, given(SEQUENCES, cameras=ids)).held_out_cameras == ("08",)
     ids["EXP-4"] = ("222200036", "222200037")
-    settings = with_named_split(NAMED, split, ids)
+    settings = fill_in(NAMED, given(SEQUENCES, cameras=ids))
     assert settings.held_out_cameras == ("08", "222200037")
-    assert with_named_split(settings, split, ids) == settings, "the config of a run can be repeated"
-    ids["EXP-4"] = ("front",)
-    for settings, cameras, words in (
-        (NAMED, ids, r"EXP-4 has no camera 08 or 222200037, which it holds out \(there are front\)"),
-        (replace(NAMED, held_out_sequences=("EMO-1",)), None, "--hold-out EMO-1: --split gaussian-avatars decides"),
-        (replace(NAMED, held_out_cameras=("03",)), None, "--hold-out-cameras 03: --split gaussian-avatars decides"),
+    assert fill_in(settings, given(SEQUENCES, cameras=ids)) == settings, "the config of a run can be repeated"
+    for settings, words in (
+        (replace(NAMED, held_out_sequences=("EMO-1",)), "--hold-out EMO-1: --split gaussian-avatars decides"),
+        (replace(NAMED, held_out_cameras=("03",)), "--hold-out-cameras 03: --split gaussian-avatars decides"),
     ):
-        refuses(words, with_named_split, settings, split, cameras)
-    refuses("are not filled in", training_frames, [toy_sequence(6, 16)[1]], NAMED)
+        refuses(words, fill_in, settings, given(SEQUENCES, cameras=ids))
+    ids["EXP-4"] = ("front",)
+    words = r"EXP-4 has no camera 08 or 222200037, which it holds out \(there are front\)"
+    refuses(words, fill_in, NAMED, given(SEQUENCES, cameras=ids))
+    refuses("is not filled in", training_frames, [toy_sequence(6, 16)[1]], NAMED)
 
 
 def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
@@ -99,10 +106,9 @@ def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
         # The task of novel views holds out the hidden cameras.
         (("HAIR",), ("222200036", FRONTAL, "222200039"), (), (FRONTAL, "222200039")),
     ):
-        ids: dict[str, tuple[str, ...]] = dict.fromkeys(names, cameras)
-        filled = with_benchmark_split(BENCHMARK, names, ids)
+        filled = fill_in(BENCHMARK, given(names, cameras=cameras))
         assert (filled.held_out_sequences, filled.held_out_cameras) == (held, hidden)
-        assert with_benchmark_split(filled, names, ids) == filled, "the config of a run can be repeated"
+        assert fill_in(filled, given(names, cameras=cameras)) == filled, "the config of a run can be repeated"
     # What it cannot hold out is told.
     for names, cameras, settings, words in (
         (["FREE"], (FRONTAL,), BENCHMARK, "holds out all of FREE, and nothing is left"),
@@ -113,7 +119,7 @@ def test_the_benchmark_holds_out_test_sequences_and_cameras() -> None:
         (["FREE", "HAIR"], (FRONTAL,), replace(BENCHMARK, held_out_cameras=("x",)), "--hold-out-cameras x: --split"),
     ):
         with pytest.raises(UserError) as told:
-            with_benchmark_split(settings, names, dict.fromkeys(names, cameras))
+            fill_in(settings, given(names, cameras=cameras))
         assert words in str(told.value)
         assert "\n" not in str(told.value)
 
@@ -155,7 +161,7 @@ def test_train_takes_the_split_by_name(first: Path, tmp_path: Path, asked: list[
     held = {"held_out_sequences": ("EXP-2-eyes",), "held_out_cameras": ("08",)}
     assert settings == replace(PRESETS["standard"].settings, split="gaussian-avatars", **held)
     shown = capsys.readouterr().err
-    assert "held out are the sequence EXP-2-eyes and camera 08; not used: FREE, SEN-01" in shown
+    assert "held out are the sequence EXP-2-eyes and the camera 08; not used: FREE, SEN-01" in shown
     assert "warning" not in shown
     config = tmp_path / "again.json"
     config.write_text(json.dumps({"settings": {"split": settings.split, "held_out_cameras": ["08"]}}))
@@ -166,7 +172,7 @@ def test_train_takes_the_split_by_name(first: Path, tmp_path: Path, asked: list[
     names, settings = asked.pop()
     assert tuple(names) == RECORDED
     assert (settings.held_out_sequences, settings.held_out_cameras) == (TESTS, ("09",))
-    assert f"held out are the sequences {', '.join(TESTS)} and the cameras 09" in capsys.readouterr().err
+    assert f"held out are the sequences {', '.join(TESTS)} and the camera 09" in capsys.readouterr().err
 
 
 @pytest.mark.unchecked

@@ -20,8 +20,7 @@ from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
-from mien.avatar.schedules import Progress, Rate
-from mien.avatar.settings import RefillSettings
+from mien.avatar.settings import Progress, Rate, RefillSettings
 from mien.camera import Camera
 from mien.commands.parsing.settings_options import leaves
 from mien.disk.config import FRACTION, NotBelow, Range, check_ranges
@@ -57,13 +56,12 @@ def rows_of(section: str) -> dict[str, tuple[str, str, str]]:
     return {name.replace("`", ""): (paper, here, why) for name, paper, here, why in cells}
 
 
-def shown(value: Any, epochs: int) -> Any:
-    """Settings for braces. A rate is its start, its end if it has one, and the epoch in which it begins."""
+def shown(value: Any) -> Any:
+    """Settings for braces. A rate is its start, and its end if it has one."""
     if isinstance(value, Rate):
-        end = "" if value.end is None else f" to {value.end}"
-        return f"{value.start}{end}" + (f" from epoch {round(value.begin * epochs)}" if value.begin else "")
+        return f"{value.start}" + ("" if value.end is None else f" to {value.end}")
     if is_dataclass(value):
-        return SimpleNamespace(**{each.name: shown(getattr(value, each.name), epochs) for each in fields(value)})
+        return SimpleNamespace(**{each.name: shown(getattr(value, each.name)) for each in fields(value)})
     return value
 
 
@@ -104,7 +102,7 @@ def figures(method: str) -> dict[str, Any]:
     """All that braces may name: the settings of a method by the preset `paper`, and what follows from them."""
     config: Any = PRESETS["paper"].config(method)
     steps = PRESETS["paper"].settings_of(method).steps
-    found = {**vars(shown(config, getattr(config, "epochs", 1))), "steps": steps}
+    found = {**vars(shown(config)), "steps": steps}
     if hasattr(config, "density"):
         found |= of_density(config, steps)
         found["times_extent"] = "times E" if config.means_times_extent else ""
@@ -120,7 +118,9 @@ def figures(method: str) -> dict[str, Any]:
         found["higher_share"] = 1 / config.sh_higher_share
     tuning = found["face_tuning"]
     found["tuning"] = "on" if tuning.enabled else "off"
-    found["face_rates"] = ", ".join(sorted({tuning.expression, tuning.joints, tuning.head_rotation}))
+    begin = f" from epoch {round(tuning.begin * getattr(config, 'epochs', 1))}" if tuning.begin else ""
+    rates = {tuning.expression, tuning.joints, tuning.head_rotation}
+    found["face_rates"] = ", ".join(f"{rate}{begin}" for rate in rates)
     return found
 
 

@@ -19,11 +19,18 @@ from mien.media.pictures import Box
 from mien.perceptual.features import load_training_features
 from mien.perceptual.weights import weights_path
 from mien.render.rendering import Rendering
-from mien.training import TrainSettings, train
-from mien.training.footage.frames import crop_random
+from mien.training import train
+from mien.training.footage.frames import CROP, random_at
 from mien.training.footage.sequence import Sequence, Target, Targets
-from mien.training.losses import drawn_crop, perceptual_goal, perceptual_loss, person_box
-from mien.training.photometric import differentiable_ssim_map, photometric_loss, photometric_loss_reference
+from mien.training.losses import (
+    differentiable_ssim_map,
+    drawn_crop,
+    perceptual_goal,
+    perceptual_loss,
+    person_box,
+    photometric_loss,
+    photometric_loss_reference,
+)
 from mien.training.run import read_curves
 from rasterize_scenes import relative_error
 from toy_scene import toy_sequence
@@ -61,15 +68,15 @@ def test_the_distance_is_that_of_the_networks_layers_in_crops_of_every_part() ->
     image, target = some_picture(0), some_picture(1)
     assert float(features(target, target)) == 0
     assert float(features(image, target)) == pytest.approx(by_torchs_layers(image, target), rel=1e-3)
-    target, settings = some_target(((20, 10, 30, 10), (70, 50, 8, 8))), TrainSettings()
-    crops, again = ([drawn_crop(target, 24, crop_random(settings, step)) for step in range(200)] for _ in range(2))
+    target = some_target(((20, 10, 30, 10), (70, 50, 8, 8)))
+    crops, again = ([drawn_crop(target, 24, random_at(0, CROP, step)) for step in range(200)] for _ in range(2))
     assert crops == again
     assert all(x >= 0 and y >= 0 and x + 24 <= 80 and y + 24 <= 60 for x, y, _, _ in crops)
     assert {crop[2:] for crop in crops} == {(24, 24)}
     near_mouth = sum(crop[:2] == (56, 36) for crop in crops)
     assert 30 < near_mouth < 110, "a third of the crops is drawn around the part at the corner"
     assert len(set(crops)) > 80, "the others differ"
-    assert drawn_crop(target, 512, crop_random(settings, 0)) == (0, 0, 80, 60)
+    assert drawn_crop(target, 512, random_at(0, CROP, 0)) == (0, 0, 80, 60)
 
 
 def some_target(parts: tuple[tuple[int, int, int, int], ...], height: int = 60, width: int = 80) -> Target:
@@ -82,7 +89,7 @@ def loss_of(width: int, settings: PerceptualLoss) -> tuple[float, torch.Size]:
     image, radii = torch.full((64, width, 3), 0.5), torch.zeros(1, dtype=torch.int32)
     rendering = Rendering(image, torch.ones(64, width), radii, torch.zeros(1, 2))
     target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
-    goal = perceptual_goal(target, settings, crop_random(TrainSettings(), 0))
+    goal = perceptual_goal(target, settings, random_at(0, CROP, 0))
     return float(perceptual_loss(rendering, goal, settings)), target.picture[goal.crop].shape
 
 

@@ -112,7 +112,7 @@ def test_footage_is_imported_an_avatar_trained_and_exported(cached: Mien, fork_s
     imports = ("import", path, "--out", out, "--face-model", "mine")
     for line in (
         imports,
-        ("train", out, "--method", "mesh_points9", "--method.start-scale", "0.01", "--steps", "2", "--split", "tail"),
+        ("train", out, "--method", "mesh_points9", "--method.rate.start", "0.01", "--steps", "2", "--split", "tail"),
         (*export, str(me)), (*export, str(tmp_path / "me.mien")),
         (*export, str(tmp_path / "talk.xyz9"), "--series", "me"), (*of_file, str(tmp_path / "again.xyz9")),
     ):  # fmt: skip

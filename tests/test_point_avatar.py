@@ -12,7 +12,7 @@ from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.point_avatar.avatar import PointAvatar, was_drawn
 from mien.avatar.point_avatar.networks import SurfaceNet
 from mien.avatar.point_avatar.settings import PointAvatarConfig
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.face import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
@@ -101,7 +101,7 @@ def test_a_color_is_albedo_times_light_on_the_normal_which_turns_with_the_head()
         last.bias.copy_(10.0 * torch.eye(len(last.bias))[0])
     points, normals = avatar.store["means"].detach() / LENGTH_UNIT, torch.randn(30, 3)
     normals = torch.nn.functional.normalize(normals, dim=-1)
-    rest, now = (avatar.motion.transforms(one)[0, 0, :, :3] for one in (avatar.motion.canonical_face(), turned))
+    rest, now = (avatar.transforms(one)[0, 0, :, :3] for one in (avatar.canonical_face(), turned))
     expected = normals @ (head_poses(turned)[0, :3, :3] @ now @ rest.T).T
     torch.testing.assert_close(avatar.deformed_normals(points, normals, turned)[0], expected, atol=1e-5, rtol=0)
 

@@ -15,7 +15,7 @@ from mien.avatar.files import write_avatar
 from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.ops.point_network import Activation, Layer, point_network, point_network_reference
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.face import FaceParams
 from mien.runtime import posing
 from mien.runtime.baked import BlendSkinned

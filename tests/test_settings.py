@@ -12,8 +12,7 @@ from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import PRESETS as mono_gaussian_avatar_presets
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, Rate
 from mien.cli import main
 from mien.pipeline import train as training
 from mien.training import PRESETS, TrainSettings
@@ -106,7 +105,7 @@ def test_options_reach_every_depth_and_win_over_the_file_and_the_file_over_the_p
         STANDARD, sh_degree=2, sh_frame="head", means_rate=Rate(4e-3, 4e-5),
         photometric=replace(STANDARD.photometric, alpha_weight=0.1),
         density=GradientSettings(grow_gradient=1e-4, max_gaussians=20_000, opacity_resets=(0.2, 0.5)),
-        face_tuning=FaceTuning(head_translation=Rate(3e-4, begin=0.5), keep_mean_pose=True, keep_turns=True),
+        face_tuning=FaceTuning(head_translation=4e-4, begin=0.5, keep_mean_pose=True, keep_turns=True),
     )  # fmt: skip
     assert choices(line) == (config, replace(RUN, steps=70, resolution=256, threads=1))
     config, _ = choices("--method headgas --method.features 8 --method.density.rounds 3")

@@ -13,7 +13,7 @@ from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.methods import method_named
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.camera import camera_from_fov
 from mien.cli import main
 from mien.disk.workspace import open_workspace
@@ -30,7 +30,8 @@ from mien.runtime.baked import MeshBound
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.tracking.scoring import head_cutter
 from mien.training import PRESETS, TrainSettings
-from mien.training.footage.frames import Frame, resolved
+from mien.training.footage.frames import Frame
+from mien.training.settings import resolved
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
 from mien.training.whole_head.soft_cut import (
     SOFT_CUT_COLLAR,
@@ -83,7 +84,7 @@ def _opaque_avatar(model: FaceModel, color: float) -> GaussianAvatars:
     avatar = method_named("gaussian_avatars").avatar(PRESETS["paper"].config("gaussian_avatars"), model, _face(model))
     assert isinstance(avatar, GaussianAvatars)
     surface_of(avatar).fill_interior(
-        torch.ones(len(model.faces), dtype=torch.bool), 0.97, torch.full((len(model.faces), 3), color)
+        torch.ones(len(model.faces), dtype=torch.bool), torch.full((len(model.faces), 3), color)
     )
     return avatar
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from known import known
 from mien.avatar.avatar import move_avatar
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.textured_mesh.avatar import TexturedMesh
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels

@@ -12,8 +12,7 @@ import train_toy
 from instruction_sets import by_threads
 from mien.adam import Moments
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.avatar.settings import PerceptualLoss, Photometric, Progress
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, train, trainer
@@ -21,7 +20,7 @@ from mien.training.batch import TrainingData, coarse_steps, next_batch
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
-from mien.training.trainer import passed, start, step
+from mien.training.trainer import start, step
 from plain_settings import plain_mono_gaussian_avatar, plain_run
 from refusals import refuses
 from test_methods import new_avatar
@@ -64,8 +63,8 @@ def test_a_step_follows_the_mean_of_its_frames() -> None:
 
 
 def test_losses_of_a_picture_are_means_and_steps_pass_every_multiple_once() -> None:
-    assert [now for now in range(1, 30, 4) if passed(now - 4 if now > 1 else 0, now, 10)] == [13, 21]
-    assert not passed(10, 11, 10)
+    assert [now for now in range(0, 30, 4) if Progress(now, 100, frames=4).reaches(10)] == [8, 16]
+    assert not Progress(10, 100).reaches(10)
     progress = Progress(8, 100, frames=4)
     assert [count for count in range(20) if progress.completes([count])] == [9, 10, 11, 12]
     weights = Photometric(0.7, 0.3, 0.2, 0.5, PerceptualLoss(0.4))

@@ -16,26 +16,23 @@ from instruction_sets import by_threads
 from mien import _native
 from mien.adam import FactoredMoments
 from mien.avatar.avatar import ParameterGroup
-from mien.avatar.gaussian_avatars.settings import SurfaceLimits
-from mien.avatar.gaussian_avatars.surface_limits import (
+from mien.avatar.ops.activation import sigmoid
+from mien.avatar.ops.expression_changes import expression_change, expression_change_reference
+from mien.avatar.ops.skin_points import skin_points, skin_points_reference
+from mien.avatar.ops.surface_limits import (
     keep_on_surface,
     keep_on_surface_reference,
     limits_of_triangles,
     pull_colors,
 )
-from mien.avatar.ops.activation import sigmoid
-from mien.avatar.ops.expression_changes import expression_change, expression_change_reference
-from mien.avatar.ops.skin_points import skin_points, skin_points_reference
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
-from mien.avatar.schedules import Progress, Rate
+from mien.avatar.settings import Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
 from mien.training.adam import (
     Adam,
-    FactoredAdamUpdate,
     FactoredUpdate,
     Update,
-    factored_adam_update,
     factored_update,
     factored_update_reference,
     update_all,
@@ -170,7 +167,7 @@ def published(given: Tensors, native: bool) -> Tensors:
     """Adam as published, by factors. The reference is another dtype."""
     values, first, second, *terms = (tensor.clone() for tensor in given)
     moments = Moments(first, second, torch.tensor(3.0))
-    factored_adam_update(FactoredAdamUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01))
+    factored_update(FactoredUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01))
     return [values, first, second, moments.step]
 
 
@@ -222,15 +219,15 @@ def limited_inputs(count: int) -> Tensors:
 
 def limited(given: Tensors, native: bool, pulled: bool) -> Tensors:
     """Gaussians within the limits of the surface, with colours that are pulled to those of triangles, or not."""
-    names, limits = ("means", "quats", "log_scales", "sh_constant"), SurfaceLimits(enabled=True)
+    names = ("means", "quats", "log_scales", "sh_constant")
     made = {name: tensor.clone() for name, tensor in zip(names, given[:4], strict=True)}
     store = GaussianStore(made, {"face_index": torch.arange(len(given[0])) % 5})
     sizes = torch.tensor([0.001, 0.002, 0.004, 0.01, 0.1])
-    table = limits_of_triangles(limits, sizes, torch.tensor([0, 0.01, 0, 0.02, 0]), torch.tensor([1, 1, 2, 2, 50.0]))
+    table = limits_of_triangles(sizes, torch.tensor([0, 0.01, 0, 0.02, 0]), torch.tensor([1, 1, 2, 2, 50.0]))
     if native:
-        keep_on_surface(store, table, limits.ratio, given[4] if pulled else None)
+        keep_on_surface(store, table, given[4] if pulled else None)
     else:
-        keep_on_surface_reference(store, table.to(given[0]), limits.ratio)
+        keep_on_surface_reference(store, table.to(given[0]))
         if pulled:
             pull_colors(store, given[4])
     moved = not torch.equal(store["sh_constant"].detach(), given[3])

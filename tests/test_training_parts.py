@@ -13,24 +13,23 @@ import train_toy
 from bounded_memory import MIB, allocating_at_most
 from mien import _native
 from mien.avatar.avatar import ParameterGroup, store_group
-from mien.avatar.schedules import Progress, Rate
-from mien.avatar.settings import Photometric
+from mien.avatar.settings import Photometric, Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
 from mien.render.rendering import Rendering
 from mien.training import train
 from mien.training.adam import Adam
-from mien.training.ahead import AHEAD, targets_ahead
+from mien.training.batch import AHEAD, targets_ahead
 from mien.training.footage.frames import (
+    DENSITY,
     FrameOrder,
     background_at,
-    density_random,
     expression_rarity,
     held_out,
+    random_at,
     training_frames,
 )
 from mien.training.footage.sequence import Sequence, Target, Targets, composite, composite_reference
-from mien.training.losses import picture_losses
-from mien.training.photometric import photometric_loss
+from mien.training.losses import photometric_loss, picture_losses
 from mien.training.settings import Split
 from mien.training.trainer import start
 from plain_settings import plain_gaussian_avatars, plain_run
@@ -105,7 +104,7 @@ def test_order_backgrounds_and_density_draws_depend_on_seed_and_step_only() -> N
     drawn = [step for step, color in enumerate(mixed) if color != [255, 255, 255]]
     assert 0.06 * 400 < len(drawn) < 0.14 * 400
     assert all(mixed[step] == background_at(settings, step).tolist() for step in drawn)
-    draws = [torch.rand(4, generator=density_random(replace(settings, seed=seed), 3)) for seed in (1, 1, 2)]
+    draws = [torch.rand(4, generator=random_at(seed, DENSITY, 3)) for seed in (1, 1, 2)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
 
@@ -161,13 +160,13 @@ def test_adam_equals_torchs_keeps_its_state_in_the_store_and_has_rates_that_fall
     assert isinstance(moments, Moments)
     assert (moments.step, set(adam.state())) == (5, {"network/weight", "network/bias"})
     assert store["means"].grad is None
-    # Learning rates fall from start to end, after their beginning. One that starts at nothing stays there.
-    late = Rate(1.0, 0.01, begin=0.5)
+    # Learning rates fall from start to end. One that starts at nothing stays there. A group may begin later.
     for rate, step, expected in (
         (Rate(1.0, 0.01), 50, 0.1), (Rate(1.0, 0.01), 100, 0.01), (Rate(0.3), 70, 0.3), (Rate(0.0, 1e-3), 50, 0.0),
-        (late, 49, 0.0), (late, 50, 1.0), (late, 75, 0.1),
     ):  # fmt: skip
         assert rate.at(Progress(step, 100)) == pytest.approx(expected, rel=1e-6, abs=0)
+    late = ParameterGroup("late", {}, Rate(1.0), begin=0.5)
+    assert [late.rate_at(Progress(step, 100)) for step in (49, 50)] == [0.0, 1.0]
 
 
 def test_frames_with_rare_expressions_come_more_often() -> None:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mien.avatar import Avatar
-from mien.avatar.gaussian_avatars.surface import GaussianSurface
+from mien.avatar.bound_surface import BoundSurface
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.face import FaceModel, FaceParams
@@ -126,9 +126,9 @@ def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequen
     return face_model, Sequence("toy", capture, toy_tracking(face_model, timesteps, size), alpha)
 
 
-def surface_of(avatar: Avatar) -> GaussianSurface:
+def surface_of(avatar: Avatar) -> BoundSurface:
     surface = avatar.surface()
-    assert isinstance(surface, GaussianSurface)
+    assert surface is not None
     return surface
 
 

@@ -56,7 +56,7 @@ from mien.runtime import write_portable
 from mien.tracking import track_subject
 from mien.tracking.fitting.resume import StageCache
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
-from mien.training.frame_gains import GAINS
+from mien.training.colors import GAINS
 from mien.training.run import read_face_track
 from photometric_case import make_photometric_case, make_textured_model
 from plain_settings import plain_config

@@ -32,7 +32,7 @@ from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
 from mien.tracking import read_tracking
 from mien.tracking.scoring_files import read_scoring
-from mien.training.frame_gains import read_gains
+from mien.training.colors import read_gains
 from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
 Read = Callable[[Path, Path], Any]

@@ -5,13 +5,12 @@ from .avatar import neutral_of as neutral_of
 from .avatar import store_group as store_group
 from .baking import as_array as as_array
 from .baking import bake_rig as bake_rig
-from .density import FixedDensity as FixedDensity
 from .files import load_avatar as load_avatar
 from .gaussian_avatars.settings import GaussianAvatarsConfig as GaussianAvatarsConfig
 from .methods import Method as Method
 from .ops.activation import sigmoid as sigmoid
-from .schedules import TRAINED as TRAINED
-from .schedules import Progress as Progress
-from .schedules import Rate as Rate
+from .settings import TRAINED as TRAINED
 from .settings import MethodConfig as MethodConfig
+from .settings import Progress as Progress
+from .settings import Rate as Rate
 from .store import GaussianStore as GaussianStore

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from mien.adam import EPSILON, FactoredGradient, FactoredMoments, Moments
 from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.density import DensityControl
-from mien.avatar.schedules import TRAINED, Progress, Rate
-from mien.avatar.settings import MethodConfig
+from mien.avatar.settings import TRAINED, MethodConfig, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -57,6 +56,8 @@ class ParameterGroup:
     """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
     halvings: tuple[float, ...] = ()
     """Times at which the rate is halved, as fractions of the run."""
+    begin: float = 0.0
+    """Time up to which the rate is 0, as a fraction of the run."""
     epsilon: float = EPSILON
     """Adam's epsilon. It does not reach gradients that are `factored`."""
     factored_moments: type[Moments] | type[FactoredMoments] = FactoredMoments
@@ -64,6 +65,8 @@ class ParameterGroup:
 
     def rate_at(self, progress: Progress) -> float:
         """The learning rate at a step."""
+        if progress.fraction < self.begin:
+            return 0.0
         halved = 0.5 ** sum(progress.fraction >= time for time in self.halvings)
         return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0) * halved
 
@@ -90,10 +93,6 @@ def network_group(name: str, network: nn.Module, rate: Rate) -> ParameterGroup:
     return ParameterGroup(name, dict(network.named_parameters()), rate)
 
 
-def _one() -> int:
-    return 1
-
-
 @dataclass(frozen=True, eq=False)
 class Pretraining:
     """Training of a new avatar before the first picture."""
@@ -110,7 +109,7 @@ class Extras:
 
     surface: BoundSurface | None = None
     """The surface that the Gaussians are bound to."""
-    frames_per_step: Callable[[], int] = _one
+    frames_per_step: Callable[[], int] = lambda: 1
     """Returns the number of training frames that the next optimiser step uses."""
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
@@ -130,6 +129,9 @@ class Avatar(nn.Module, ABC):
 
     Methods implement what is abstract and override nothing else. What only some methods have is in `extras`.
     """
+
+    store: GaussianStore
+    """Holds every per-Gaussian tensor. The method's constructor makes it."""
 
     def __init__(self, config: MethodConfig, face_model: FaceModel, face: FaceParams, extras: Extras = Extras()):
         super().__init__()
@@ -154,16 +156,17 @@ class Avatar(nn.Module, ABC):
         """The trained tensors and their learning rates. Called again after density control has changed the store."""
 
     @abstractmethod
-    def gaussian_store(self) -> GaussianStore:
-        """The store that holds every per-Gaussian tensor."""
-
-    @abstractmethod
     def density(self) -> DensityControl:
         """The density control, with this method's hooks."""
 
     @abstractmethod
     def bake(self) -> BakedAvatar:
         """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""
+
+    @final
+    def gaussian_store(self) -> GaussianStore:
+        """The store that holds every per-Gaussian tensor."""
+        return self.store
 
     @final
     def surface(self) -> BoundSurface | None:

@@ -1,30 +1,37 @@
-"""From an avatar with tensors to the records of `mien.runtime`, which need no torch: what `Avatar.bake` is built from.
+"""From an avatar with tensors to the records of `mien.runtime`, which need no torch, and faces posed by them.
 
 A method fills one of three records (`mien.runtime.baked`): `MeshBound`, `BlendSkinned` or `Static`. `as_array` converts
 its tensors, and `bake_rig` converts the face model. `make_portable` adds the facts about subject, face model and camera
 that a program needs, which makes the content of a .mien file.
 """
 
+from collections.abc import Callable, Iterable
+from typing import Generic, TypeVar
+
 import numpy as np
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Float
 from torch import Tensor
 
 import mien
+from mien import runtime
+from mien.arrays import is_native
 from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_of
+from mien.avatar.ops.expression_changes import expression_inputs
+from mien.avatar.store import as_array
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.face.listing import available_face_models
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.face.posing import head_poses
+from mien.gaussians import Gaussians
 from mien.runtime import baked
-from mien.runtime.baked import About, Neutral, PortableAvatar, Rig
+from mien.runtime.baked import About, BakedAvatar, Filmed, Neutral, PortableAvatar, Rig
+from mien.runtime.filmed import head_angles
 
-
-def as_array(tensor: Tensor) -> Shaped[np.ndarray, "..."]:
-    """A copy of a tensor as a contiguous array: float32 for floating point, int32 for everything else."""
-    return np.array(tensor.detach().cpu().numpy(), np.float32 if tensor.is_floating_point() else np.int32, order="C")
+_FILMED_LEAST_SPREAD = 0.3  # spread that every direction of expressions has at least, relative to the largest
 
 
 @torch.no_grad()
@@ -48,11 +55,7 @@ def bake_rig(face_model: FaceModel, subject: FaceParams) -> Rig:
 def make_portable(avatar: Avatar, camera: Camera, name: str, to_share: bool = True) -> PortableAvatar:
     """The content of a .mien file for an avatar (`mien.runtime.write_portable` writes it).
 
-    Args:
-        avatar: A trained avatar.
-        camera: A good first view, such as the one that the avatar was trained with.
-        name: The subject's name.
-        to_share: Whether the result leaves this machine, as a file does.
+    The camera is a good first view. `to_share` says that the result leaves this machine, as a file does.
     """
     model, subject = avatar.face_model, avatar.subject
     if to_share and not model.shareable:
@@ -84,3 +87,69 @@ def make_portable(avatar: Avatar, camera: Camera, name: str, to_share: bool = Tr
         ),
         filmed=avatar.filmed,
     )
+
+
+@torch.no_grad()
+def measure_filmed(face: FaceParams, neutral: FaceParams, eyes: Float[Tensor, "b 3"]) -> Filmed:
+    """The range of some training frames: expressions and head poses, which driving keeps to.
+
+    `neutral` is the person at rest, and `eyes` are the cameras' positions in world space, in metres.
+    """
+    inputs = expression_inputs(face.detach()).double().cpu()
+    offsets = inputs - expression_inputs(neutral.detach())[0].double().cpu()
+    variances, vectors = torch.linalg.eigh(offsets.T @ offsets / len(offsets))
+    least = max(_FILMED_LEAST_SPREAD**2 * float(variances[-1]), 1e-6)
+    directions = vectors / (variances.clamp_min(0) + least).sqrt()
+    poses = (face.head_rotation, face.head_translation, eyes)
+    angles = head_angles(*(tensor.detach().double().cpu().numpy() for tensor in poses))
+    return Filmed(
+        lowest=inputs.amin(0).float().numpy(),
+        highest=inputs.amax(0).float().numpy(),
+        directions=directions.float().numpy(),
+        reach=(offsets @ directions).norm(dim=1).amax(0, keepdim=True).float().numpy(),
+        head_angles=np.stack([angles.min(0), angles.max(0)], axis=1).astype(np.float32),
+    )
+
+
+T = TypeVar("T")
+
+
+class Kept(Generic[T]):
+    """A result that is kept until one of the tensors that it was made from changes."""
+
+    def __init__(self) -> None:
+        self._of: list[tuple[Tensor, int]] = []
+        self._result: T | None = None
+
+    def of(self, tensors: Iterable[Tensor], make: Callable[[], T]) -> T:
+        """The result of `make`, called again only if there are other tensors, or torch has changed one in place."""
+        # Held here, so that no other tensor can take the place of one that is gone.
+        now = [(tensor, tensor._version) for tensor in tensors]
+        same = len(now) == len(self._of) and all(
+            a is b and version == before for (a, version), (b, before) in zip(now, self._of, strict=True)
+        )
+        if self._result is None or not same:
+            self._of, self._result = now, make()
+        return self._result
+
+
+def can_pose_baked(like: Tensor, face: FaceParams) -> bool:
+    """Whether the runtime can pose a face: on a CPU, in float32, without gradients."""
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in face.tensors().values())
+    return is_native(like) and not wanted
+
+
+@torch.no_grad()
+def pose_baked(baked: BakedAvatar, face: FaceParams) -> Gaussians:
+    """The Gaussians of some timesteps, as a batch, from a baked avatar in the head frame."""
+    found = []
+    for timestep in range(len(face)):
+        names = ("expression", "joints", "head_rotation", "head_translation")
+        own = (getattr(face, name)[timestep].detach().float().cpu().contiguous().numpy() for name in names)
+        found.append(runtime.pose(baked, runtime.Face(*own)))
+    means, quats, scales, opacities, sh = (
+        torch.stack([torch.from_numpy(getattr(one, name)) for one in found])
+        for name in ("means", "quats", "scales", "opacities", "sh")
+    )
+    quats = torch.nn.functional.normalize(quats, dim=-1)
+    return Gaussians(means, quats, scales, opacities, sh, head_poses(face).detach())

@@ -1,21 +1,30 @@
-"""The surface that an avatar's Gaussians are bound to: what is known of it, and what training may do with it.
+"""The surface that Gaussians are bound to: one or more on each triangle of a face model, in the triangle's frame.
 
-Methods that bind Gaussians to triangles of the face model have a `BoundSurface` (`Avatar.surface`). Parts of a training
-that close a head, move its hair or fill its mouth work on it alone, and never know the method.
+A method that binds its Gaussians hands a `BoundSurface` to `Extras`. Training then closes heads, moves hair and fills
+mouths on it (`mien.training.whole_head`).
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-FILL_OPACITY = 0.97  # opacity of a fill
+from mien.avatar.ops.hair_strands import shell_growth, strand_gaussians
+from mien.avatar.ops.surface_limits import keep_on_surface, limits_of_triangles, pull_colors
+from mien.avatar.ops.triangle_frames import triangle_ellipses, triangle_frames
+from mien.avatar.store import GaussianStore
+from mien.gaussians import sh_from_rgb
 
+FILL_OPACITY = 0.97  # opacity of a fill
 _FILL_HEIGHT_SHARE = 0.9
 """Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it.
 Measured: 0.5 has 0.2 dB more at 30 degrees and 0.3 less at 90, and 1 has 0.2 dB less at 30 (log, 11-24)."""
+_OPEN_OPACITY = 0.5  # sum of the opacities of a triangle's Gaussians below which its surface is open
+_COLOR_PULL = 0.05
+"""Share of the difference to the completed colour that a step takes away where no picture shows a triangle. Measured: a
+tenth of it has 0.5 dB less in front (log, 11-23)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +34,7 @@ class SurfacePrior:
     hair: Float[Tensor, " f"]
     """Height of hair along the triangle's normal, in metres; 0 on skin that no hair hangs over."""
     hanging: Float[Tensor, " f"] | None = None
-    """How far hair that hangs beside skin and neck stands out along the normal, in metres. None means 0."""
+    """How far hair beside skin and neck stands out along the normal, in metres. None means 0."""
     colors: Float[Tensor, "f 3"] | None = None
     """Colours, 0..1, completed where no picture shows any. None if nothing was completed."""
     doubt: Float[Tensor, " f"] | None = None
@@ -33,87 +42,193 @@ class SurfacePrior:
     filled_in: Bool[Tensor, " f"] | None = None
     """Triangles that are filled rather than trained: no picture shows them, and they are above the cut at the neck."""
     closed: Bool[Tensor, " f"] | None = None
-    """Triangles that are an opaque surface before the first step: the made-up ones, and the inside of the mouth, which
-    is trained where pictures show it. None if these are the made-up ones."""
+    """Triangles that are opaque before the first step: `filled_in` and the inside of the mouth. None: `filled_in`."""
     strands: Bool[Tensor, " f"] | None = None
-    """Made-up triangles that are covered with strands of hair. None means none."""
+    """Filled triangles that are covered with strands of hair. None means none."""
     widening: Float[Tensor, " f"] | None = None
-    """Factors on the limits to the surface (`BoundSurface.keep_to`), for parts that the mesh fits less well. None
-    means 1."""
+    """Factors on the limits to the surface, for parts that the mesh fits less well. None means 1."""
 
     @property
     def fill_height(self) -> Float[Tensor, " f"]:
         """Height at which a fill lies above its triangle, in metres."""
         return _FILL_HEIGHT_SHARE * self.hair
 
+    def to(self, like: Tensor) -> "SurfacePrior":
+        """The same on the device of `like`, with its float dtype."""
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        given = {name: tensor for name, tensor in own.items() if tensor is not None}
+        return replace(
+            self, **{name: one.to(like if one.is_floating_point() else like.device) for name, one in given.items()}
+        )
 
-class BoundSurface(ABC):
-    """Operations of training on Gaussians that are bound to the f triangles of a face model, between two steps."""
 
-    @abstractmethod
+class BoundSurface:
+    """Gaussians that are bound to triangles, as a surface. All of its state is the avatar's.
+
+    Args:
+        store: Returns the store, with `face_index` and the tensors `means, quats, log_scales, opacity_logits,
+            sh_constant` in the frames of triangles. Others are 0 on fills.
+        mesh: Returns vertices and faces of the person's neutral head in the head frame.
+        limited: Whether Gaussians are kept flat on the surface, also if nothing is filled.
+        first_colors: Whether the first colours are those of the training pictures.
+        penalties: The method's weighted penalties of changes with the expression (`Posed.aux`), by name.
+    """
+
+    def __init__(
+        self,
+        store: Callable[[], GaussianStore],
+        mesh: Callable[[], tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]],
+        *,
+        limited: bool,
+        first_colors: bool,
+        penalties: Callable[[Mapping[str, Tensor]], dict[str, Float[Tensor, ""]]],
+    ):
+        self.limited, self.wants_first_colors = limited, first_colors
+        self._get_store, self._mesh, self._penalties = store, mesh, penalties
+        self._known: Tensor | None = None
+        self._tables: tuple[SurfacePrior, Tensor | None, Tensor | None] | None = None
+
+    @property
+    def _store(self) -> GaussianStore:
+        return self._get_store()
+
     def triangles(self) -> Int[Tensor, " n"]:
         """The triangle that each Gaussian is bound to."""
+        return self._store["face_index"]
 
     @property
-    @abstractmethod
-    def wants_first_colors(self) -> bool:
-        """Whether `set_first_colors` is to be called before the first step."""
+    def sizes(self) -> Float[Tensor, " f"]:
+        """Sizes of the triangles of the neutral head, in metres per triangle unit."""
+        if self._known is None:
+            self._known = triangle_frames(*self._mesh()).k.detach()
+        return self._known.to(self._store["means"])  # the avatar may have moved since
 
-    @abstractmethod
+    @torch.no_grad()
     def set_first_colors(self, colors: Float[Tensor, "v 3"]) -> None:
-        """Take the face model's vertices' mean colours in the training pictures, 0..1, as first colours."""
+        """Give every Gaussian the mean of its triangle's three vertices' colours, 0..1."""
+        corners = self._mesh()[1][self.triangles()].long()
+        own = colors.to(self._store["sh_constant"])[corners].mean(1)
+        self._store.assign("sh_constant", sh_from_rgb(own)[:, None])
 
-    @property
-    @abstractmethod
-    def limited(self) -> bool:
-        """Whether `keep_to` is to be called after each step, also if nothing is filled."""
-
-    @abstractmethod
+    @torch.no_grad()
     def close(self, prior: SurfacePrior) -> None:
-        """Start from what is known of the surface, before the first step: colours, and fills of what nothing shows."""
+        """Start from completed colours everywhere, and an opaque flat Gaussian on what no picture shows.
 
-    @abstractmethod
+        It lies at the height of hair. Strands of hair are added where the prior says so.
+        """
+        closed = prior.filled_in if prior.closed is None else prior.closed
+        if prior.colors is None or closed is None:
+            return
+        store, bound = self._store, self.triangles()
+        filled, fills = closed[bound], {name: values[bound] for name, values in self._fills(prior).items()}
+        store.assign("sh_constant", sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None])
+        store.assign("means", fills["means"])
+        for name in ("quats", "log_scales", "opacity_logits"):
+            chosen = filled.view(-1, *[1] * (store[name].ndim - 1))
+            store.assign(name, torch.where(chosen, fills[name], store[name]))
+        if prior.strands is not None and bool(prior.strands.any()):
+            own = strand_gaussians(*self._mesh(), prior.strands, prior.fill_height, prior.colors)
+            rest = {name: store[name].new_zeros(len(own["means"]), *store[name].shape[1:]) for name in store.trained}
+            store.append(torch.zeros(len(own["means"]), dtype=torch.long), rest | own)
+
+    @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
-        """Bring Gaussians back that have left what is known of the surface, after each step."""
+        """Bring Gaussians that left the surface back, and pull colours of what is rarely seen to the completed ones."""
+        if self._tables is None or self._tables[0] is not prior:
+            self._tables = (prior, *self._tables_of(prior))
+        _, limits, pulls = self._tables
+        if limits is not None:
+            keep_on_surface(self._store, limits, pulls)
+        elif pulls is not None:
+            pull_colors(self._store, pulls)
 
-    @abstractmethod
+    @torch.no_grad()
     def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:
-        """Give some Gaussians the completed colours of their triangles.
+        """Give some Gaussians completed colours. With `close`, they also get place, shape and opacity of fills."""
+        if prior.colors is None or not len(rows):
+            return
+        store, bound = self._store, self.triangles()[rows]
+        values = {"sh_constant": sh_from_rgb(prior.colors.to(store["means"])[bound])[:, None]}
+        if close:
+            values |= {name: own[bound] for name, own in self._fills(prior).items()}
+            rest = [name for name in store.trained if name not in values]
+            values |= {name: torch.zeros_like(store[name][rows]) for name in rest}
+        for name, own in values.items():
+            store.assign_rows(name, rows, own)
 
-        With `close`, they also get place, shape and opacity of fills, as at the start.
-        """
-
-    @abstractmethod
+    @torch.no_grad()
     def height_gradient(self) -> Float[Tensor, " f"] | None:
-        """Derivative of the loss by the height of each triangle's Gaussians above it, per metre, after a backward pass.
+        """Derivative of the loss by the height of each triangle's Gaussians above it, per metre; None without any.
 
-        It is the sum over the triangle's Gaussians. None if there is none.
+        The second axis of a triangle's frame is its normal.
         """
+        gradient, bound = self._store["means"].grad, self.triangles()
+        if gradient is None:
+            return None
+        sizes = self.sizes
+        return torch.zeros_like(sizes).index_add_(0, bound, gradient[:, 1] / sizes.index_select(0, bound))
 
-    @abstractmethod
+    @torch.no_grad()
     def raise_by(self, shift: Float[Tensor, " f"]) -> None:
         """Move Gaussians along the normals of their triangles, by metres."""
+        self._store["means"].detach()[:, 1] += (shift / self.sizes)[self.triangles()]
 
-    @abstractmethod
     def change_penalty(self, changes: Mapping[str, Tensor], held: Bool[Tensor, " f"]) -> Float[Tensor, ""] | None:
-        """The method's own penalty of changes with the expression that the mesh does not make (`Posed.aux`).
+        """The method's penalty of changes that the mesh does not make, as a mean over all Gaussians.
 
-        It is the mean over all Gaussians, to which those on triangles that are not `held` add 0. None if there are no
-        changes.
-
-        Args:
-            changes: The changes of one timestep.
-            held: The triangles whose changes cost something.
+        Those on triangles that are not `held` add 0. None if there are no changes.
         """
+        counts = held.index_select(0, self.triangles())
+        own = {name: values * counts.view(-1, *[1] * (values.ndim - 1)) for name, values in changes.items()}
+        penalties = self._penalties(own)
+        return torch.stack(list(penalties.values())).sum() if penalties else None
 
-    @abstractmethod
-    def fill_interior(self, chosen: Bool[Tensor, " f"], opacity: float, colors: Float[Tensor, "f 3"]) -> None:
-        """Close the surface of those of the chosen triangles that are less than half opaque.
+    @torch.no_grad()
+    def fill_interior(self, chosen: Bool[Tensor, " f"], colors: Float[Tensor, "f 3"]) -> None:
+        """Replace the first Gaussian of each chosen triangle that is open by a flat one in the triangle's shape.
 
-        The number of Gaussians does not change.
-
-        Args:
-            chosen: Triangles that may be closed.
-            opacity: Opacity of closed triangles.
-            colors: Their colours, 0..1.
+        A triangle is open if its Gaussians are less than half opaque together.
         """
+        store, like, bound = self._store, self._store["means"], self.triangles().long()
+        opacities = store["opacity_logits"].sigmoid()
+        total = opacities.new_zeros(len(chosen)).index_add(0, bound, opacities)
+        order = torch.arange(len(store), device=bound.device)
+        first = torch.full_like(chosen, len(store), dtype=torch.long).scatter_reduce(0, bound, order, "amin")
+        opened = (chosen & (total < _OPEN_OPACITY) & (first < len(store))).nonzero()[:, 0]
+        quats, log_scales = triangle_ellipses(*self._mesh())
+        flat = {
+            **{name: like.new_zeros(len(opened), *store[name].shape[1:]) for name in store.trained},
+            "face_index": opened,
+            "quats": quats[opened],
+            "log_scales": log_scales[opened],
+            "opacity_logits": torch.logit(like.new_full((len(opened),), FILL_OPACITY)),
+            "sh_constant": sh_from_rgb(colors.to(like)[opened])[:, None],
+        }
+        for name, values in flat.items():
+            store.assign_rows(name, first[opened], values)
+
+    def _fills(self, prior: SurfacePrior) -> dict[str, Tensor]:
+        """Place, shape and opacity of each triangle's fill: opaque, flat, at the height of hair."""
+        vertices, faces = self._mesh()
+        quats, log_scales = triangle_ellipses(vertices, faces)
+        height = prior.fill_height
+        wider = shell_growth(vertices, faces, height).log()[:, None] * log_scales.new_tensor([1.0, 0.0, 1.0])
+        return {
+            "means": torch.stack([0 * height, height / self.sizes, 0 * height], 1),
+            "quats": quats,
+            "log_scales": log_scales + wider,
+            "opacity_logits": torch.logit(torch.full_like(height, FILL_OPACITY)),
+        }
+
+    def _tables_of(self, prior: SurfacePrior) -> tuple[Float[Tensor, "f 5"] | None, Float[Tensor, "f 4"] | None]:
+        """The limits and the pulls of colours of all triangles."""
+        limits = pulls = None
+        if self.limited or prior.filled_in is not None:
+            hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
+            limits = limits_of_triangles(self.sizes, hair, prior.widening)
+        if prior.colors is not None and prior.doubt is not None:
+            # What is made up has the colours that it was given, strand by strand.
+            doubt = prior.doubt if prior.filled_in is None else prior.doubt.masked_fill(prior.filled_in, 0)
+            colors = torch.cat([sh_from_rgb(prior.colors), _COLOR_PULL * doubt[:, None]], dim=1)
+            pulls = colors.to(self._store["means"])
+        return limits, pulls

@@ -5,7 +5,7 @@ these descriptions, never the method.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,16 +16,6 @@ from mien.avatar.store import GaussianStore
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
 from mien.rotation import matrix_from_quaternion
-
-
-def allow_all_prunes(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """The hook of methods that let every Gaussian be pruned."""
-    return prune
-
-
-def highest_opacities_seen(store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """The hook of methods whose opacity depends on the face: prune by the highest opacity since the last round."""
-    return seen
 
 
 def split_along_axes(
@@ -51,27 +41,14 @@ class GradientDensity:
     settings: GradientSettings
     opacity_logits: str | None
     """Name of the store's raw opacity, which resets lower. None if opacity comes from a network: no resets then."""
-    judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] = highest_opacities_seen
-    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
+    judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
+    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by. None: the latter."""
     split: Callable[[GaussianStore, Int[Tensor, " p"], Float[Tensor, "p 3"]], dict[str, Tensor]] = split_along_axes
     """(store, parents, standard normal noise) -> tensors, by name, in which children differ from their parents."""
-    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
-    """(store, prunes requested) -> prunes allowed."""
+    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] | None = None
+    """(store, prunes requested) -> prunes allowed. None: all."""
     may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]] | None = None
     """(store) -> Gaussians whose opacity resets lower. None if they all are."""
-
-    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "GradientDensity":
-        """The same control with `may_reset`, and with a limit that is higher by `extra` Gaussians."""
-        return replace(
-            self,
-            settings=replace(self.settings, max_gaussians=self.settings.max_gaussians + extra),
-            may_reset=may_reset,
-        )
-
-
-def drawn_opacities(gaussians: Gaussians, rendering: Rendering) -> Float[Tensor, " n"]:
-    """The hook of methods whose Gaussians are visible by their opacity."""
-    return gaussians.opacities.detach().reshape(-1)
 
 
 @dataclass(frozen=True)
@@ -82,26 +59,14 @@ class RefillDensity:
     refill: Callable[[GaussianStore, Int[Tensor, " p"], Float[Tensor, "p 3"], float], Mapping[str, Tensor]]
     """(store, parents, noise uniform in -0.5..0.5, fraction of the run) -> tensors, by name, in which children differ
     from their parents."""
-    judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] = highest_opacities_seen
-    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by."""
-    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] = allow_all_prunes
-    """(store, prunes requested) -> prunes allowed."""
-    observed: Callable[[Gaussians, Rendering], Float[Tensor, " n"]] = drawn_opacities
-    """(Gaussians of a step, their picture after the backward pass) -> how visible each Gaussian is, 0..1. The highest
-    value since the last round stands for the opacity."""
-
-    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "RefillDensity":
-        """The same control, which resets no opacity and has no limit."""
-        return self
+    judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
+    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by. None: the latter."""
+    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] | None = None
+    """(store, prunes requested) -> prunes allowed. None: all."""
+    observed: Callable[[Gaussians, Rendering], Float[Tensor, " n"]] | None = None
+    """(Gaussians of a step, their picture after the backward pass) -> how visible each Gaussian is, 0..1, in the place
+    of its opacity."""
 
 
-@dataclass(frozen=True)
-class FixedDensity:
-    """The number of Gaussians never changes."""
-
-    def sparing(self, may_reset: Callable[[GaussianStore], Bool[Tensor, " n"]], extra: int) -> "FixedDensity":
-        """The same control, which resets no opacity and has no limit."""
-        return self
-
-
-DensityControl = GradientDensity | RefillDensity | FixedDensity
+DensityControl = GradientDensity | RefillDensity | None
+"""None: the number of Gaussians never changes."""

@@ -12,7 +12,6 @@ from mien.avatar.methods import method_named, method_of
 from mien.disk.config import decode, encode, for_loading
 from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.disk.inside import check_subtrees, check_tree
-from mien.disk.limits import MAX_NUMBER
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -23,14 +22,11 @@ from mien.runtime.baked import Filmed
 from mien.runtime.checks import baked_fault, filmed_fault
 
 _AVATAR, _VERSION = "mien.avatar", 1
-_MAX_INDEX = 2**31 - 1
 _REMEDY = "delete the run's training.json, if it is there, and train it again with `mien train`"
 
 
 @dataclass(frozen=True)
 class _Content:
-    """Content of avatar.json."""
-
     kind: str
     """The method's name."""
     config: dict[str, Any]
@@ -64,12 +60,7 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
 
 
 def load_avatar(folder: Path) -> Avatar:
-    """Load the avatar of a run folder, or of an avatar folder itself.
-
-    Raises:
-        UserError: the folder holds no avatar, or holds a link; or the avatar is damaged, cannot be posed, is being
-            written, or needs a face model that is missing.
-    """
+    """Load the avatar of a run folder, or of an avatar folder itself."""
     return read_beside_writers(lambda: _load_avatar(folder), [folder, folder / "avatar"], [folder, folder.parent])
 
 
@@ -90,8 +81,6 @@ def _load_avatar(folder: Path) -> Avatar:
     stored = read_json(folder / "avatar.json", _AVATAR, _VERSION, remedy=_REMEDY)
     named = {name: value for name, value in stored.items() if name not in ("format", "version")}
     content: _Content = decode(_Content, named, where, _REMEDY)
-    if content.gaussians < 0:
-        raise UserError(f"{where}: has {content.gaussians} Gaussians; {_REMEDY}")
     try:
         method = method_named(content.kind)
     except UserError as error:
@@ -128,39 +117,16 @@ def _filmed(tensors: dict[str, Tensor], avatar: Avatar, folder: Path) -> Filmed 
 
 @torch.no_grad()
 def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: Path) -> None:
-    """Replace every tensor of an avatar. The number of Gaussians may change."""
-    misfit = _misfit(avatar.state_dict(), state, gaussians)
-    if misfit is not None:
-        raise UserError(f"{source}: does not fit its settings ({misfit}); train it again")
-    avatar.gaussian_store().resize(gaussians)
-    try:
+    """Replace every tensor of an avatar. The number of Gaussians may change. A record of it must be possible."""
+    with expect_whole(source, "train it again"):
+        if gaussians not in {len(tensor) for tensor in state.values() if tensor.ndim}:
+            raise ValueError(f"no tensor has {gaussians} Gaussians")
+        avatar.gaussian_store().resize(gaussians)
         avatar.load_state_dict(state)
-    except UserError as error:
-        raise UserError(f"{source}: {error}; train it again") from None
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{source}: does not fit its settings ({reason}); train it again") from None
-    # A few avatars have no record, and only drawing them can tell.
-    fault = baked_fault(avatar.bake()) if avatar.extras.unbaked is None else None
+        # A few avatars have no record, and only drawing them can tell.
+        fault = baked_fault(avatar.bake()) if avatar.extras.unbaked is None else None
     if fault is not None:
         raise UserError(f"{source}: cannot be posed ({fault}); train it again")
-
-
-def _misfit(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) -> str | None:
-    """The reason why `state` cannot replace `own`, or None. Found before memory for the Gaussians is allocated."""
-    for name, tensor in own.items():
-        if name not in state:
-            return f"lacks {name!r}"
-        found = state[name]
-        if found.dtype != tensor.dtype or found.shape[1:] != tensor.shape[1:] or found.ndim != tensor.ndim:
-            return f"{name!r} is of type {found.dtype} and shape {list(found.shape)}"
-        if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= MAX_NUMBER)):
-            return f"{name!r} holds NaN or numbers beyond {MAX_NUMBER:g}"
-        # Baking narrows indices to 32 bits: what is larger would come round to one that exists.
-        if found.dtype == torch.int64 and found.numel() > 0 and not (found.min() >= 0 and found.max() <= _MAX_INDEX):
-            return f"{name!r} holds numbers that are not indices"
-    known = {len(tensor) for tensor in state.values() if tensor.ndim > 0 and tensor[:1].numel() > 0}
-    return None if gaussians == 0 or gaussians in known else f"no tensor has {gaussians} Gaussians"
 
 
 def _face_model_of(folder: Path, content: _Content) -> FaceModel:

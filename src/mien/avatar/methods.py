@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Method:
-    """A method: the class of its avatars, and its settings. Both are imported at their first use.
-
-    That raises UserError, in one line that names the class, if it belongs to another package and cannot be imported.
-    """
+    """A method: the class of its avatars, and its settings. Both are imported at their first use."""
 
     avatar_class: str
     """"MODULE:CLASS"; see `avatar`."""
@@ -40,11 +37,7 @@ class Method:
 
     @property
     def presets(self) -> Mapping[str, Differences]:
-        """How each preset of `mien.training.PRESETS` that the method has differs from the defaults.
-
-        Every method has `draft`, `standard` and `fine`. The module of its settings adds to the first, and adds
-        others, by `PRESETS`.
-        """
+        """How each preset that the method has differs from the defaults. `PRESETS` beside its settings adds to them."""
         with _imports(self.config_class):
             own = getattr(importlib.import_module(self.config_class.split(":")[0]), "PRESETS", {})
         return {"draft": {}, "standard": {}, "fine": {}, **own}
@@ -87,14 +80,8 @@ METHODS = {
 }
 """Mien's own methods by name. A method whose settings import torch comes last: looking for the method of a config goes
 through the settings in this order."""
-
 DEFAULT_METHOD = "gaussian_avatars"
-"""Method of a run that names none."""
-
-
-_GROUP = "mien.methods"
-"""Group of entry points of other packages. It takes 30 ms to read, and commands that name one of mien's own methods do
-not read it."""
+_GROUP = "mien.methods"  # of entry points. It takes 30 ms to read, and commands that name one of mien's own do not
 
 
 def method_names() -> list[str]:
@@ -122,7 +109,6 @@ def method_of(config: MethodConfig) -> str:
 
 
 def _is_of(method: Method, config: MethodConfig) -> bool:
-    """Whether a config belongs to a method. None belongs to a method of a package that cannot be imported."""
     try:
         return method.config is type(config)
     except UserError:

@@ -1,18 +1,84 @@
-"""Settings that several methods share. Needs no torch, because the command line lists and checks them.
+"""Settings that several methods share, learning rates, and the progress that schedules depend on.
 
-Every number has its range beside it (`mien.disk.config`), and every field a description that `--help-all` shows.
+Needs no torch, because the command line lists and checks settings. Every number has its range beside it
+(`mien.disk.config`), and every field a description that `--help-all` shows.
 """
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypedDict, final
 
-from mien.avatar.schedules import Rate
 from mien.disk.config import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of training: everything that schedules may depend on."""
+
+    step: int
+    """Number of steps before this one."""
+    steps: int
+    """Number of steps of the whole run."""
+    epoch: int = 0
+    """Number of passes over the training frames that were completed before this step."""
+    extent: float = 1.0
+    """Extent of the training cameras, in metres (`camera_extent` in `mien.training.footage`). The unit of some rates
+    and sizes."""
+    frames: int = 1
+    """Number of training frames that this step uses. It counts as so many steps."""
+
+    @property
+    def fraction(self) -> float:
+        """0 at the first step, 1 after the last."""
+        return self.step / self.steps
+
+    @property
+    def done(self) -> int:
+        """Number of steps after this one."""
+        return self.step + self.frames
+
+    def reaches(self, every: int) -> bool:
+        """Whether a multiple of a number of steps is done after this step, and was not before it."""
+        return self.done // every > self.step // every
+
+    def completes(self, steps: Iterable[int]) -> bool:
+        """Whether one of these numbers of steps is done after this step, and was not before it."""
+        return any(self.step < count <= self.done for count in steps)
+
+
+def active_degree(degree: int, warmup: float, progress: Progress) -> int:
+    """Highest degree of spherical harmonics that is switched on, of `degree`, if all are from the time `warmup` on."""
+    return min(degree, int(progress.fraction / max(warmup, 1e-9) * (degree + 1)))
+
+
+TRAINED = Progress(step=1, steps=1, epoch=1_000_000)
+"""Progress after training: every schedule is at its end."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate over the run: constant, or log-linear from `start` to `end`."""
+
+    start: Annotated[float, Range(0, 100)]
+    """The rate at the first step. With 0, nothing is learned, whatever `end` is."""
+    end: Annotated[float | None, Range(1e-12, 100)] = None
+    """The rate at the last step. If it is not given, the rate is constant."""
+
+    def at(self, progress: Progress) -> float:
+        """The rate at a step."""
+        if self.end is None or self.start == 0:
+            return self.start
+        along = progress.fraction
+        return math.exp((1 - along) * math.log(self.start) + along * math.log(self.end))
+
 
 GAUSSIAN_COUNT = Range(1, 10_000_000)
 """Range of a number of Gaussians. Tens of millions would not fit into memory."""
 EPSILON_RANGE = Range(1e-30, 1)
 """Range of Adam's epsilon."""
+RATE = Range(0, 100)
+"""Range of a learning rate."""
 
 
 class Differences(TypedDict, total=False):
@@ -32,8 +98,8 @@ class PerceptualLoss:
     """
 
     weight: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Weight of the distance of features. A crop counts by its share of the picture's pixels, so that the weight of one
-    pixel does not depend on the crop. The whole person (`region`) counts fully. 0 switches the loss off."""
+    """Weight of the distance of features. A crop counts by its share of the picture's pixels, the whole person
+    (`region`) fully. 0 switches the loss off."""
     start: Annotated[float, FRACTION] = 0.3
     """Time of the first step with this loss, as a fraction of the run."""
     every: Annotated[int, Range(1, 1_000)] = 8
@@ -41,10 +107,10 @@ class PerceptualLoss:
     crop: Annotated[int, Range(16, 512)] = 64
     """Side of the crops, in pixels of the training pictures. The cost grows with its square."""
     blocks: Annotated[int, Range(1, 3)] = 2
-    """Number of blocks of the network, from fine to coarse features. Each block more doubles the cost, or more."""
+    """Number of blocks of the network, from fine to coarse features. Each doubles the cost, or more."""
     region: Literal["parts", "person"] = "parts"
-    """Pixels that a step compares: a crop drawn at random around the eyes, around the mouth, or anywhere in the scoring
-    mask's box (parts), or all of that box (person), which takes many times as long."""
+    """What a step compares: a crop drawn at random around the eyes, the mouth, or anywhere in the scoring mask's box
+    (parts), or all of that box (person), which takes many times as long."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether a step of a run of `steps` has this loss."""
@@ -66,7 +132,7 @@ class Photometric:
     alpha_weight: Annotated[float, NOT_NEGATIVE] = 0.0
     """Weight of the mean absolute difference between the rendering's alpha and the matte."""
     part_weight: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Additional weight of L1 and SSIM in the boxes around eyes and mouth. With 1, these pixels count twice."""
+    """Additional weight of L1 and SSIM in the boxes around eyes and mouth."""
     perceptual: PerceptualLoss = field(default_factory=PerceptualLoss)
     """A loss of trained features on small crops."""
 
@@ -97,53 +163,39 @@ class FaceTuning:
     """
 
     enabled: bool = True
-    """Whether training corrects the tracking. Held-out frames get corrections interpolated from the training frames
-    around them."""
-    expression: Rate = Rate(1e-3)
+    """Whether training corrects the tracking. Corrections of held-out frames are interpolated."""
+    expression: Annotated[float, RATE] = 1e-3
     """Learning rate of the expression coefficients, per step."""
-    joints: Rate = Rate(1e-3)
+    joints: Annotated[float, RATE] = 1e-3
     """Learning rate of the free joints' angles, in radians per step."""
-    head_rotation: Rate = Rate(1e-3)
+    head_rotation: Annotated[float, RATE] = 1e-3
     """Learning rate of the head's rotation, in radians per step."""
-    head_translation: Rate = Rate(3e-4)
+    head_translation: Annotated[float, RATE] = 3e-4
     """Learning rate of the head's position, in metres per step."""
+    begin: Annotated[float, FRACTION] = 0.0
+    """Time up to which faces do not change, as a fraction of the run."""
     keep_mean_pose: bool = False
-    """Whether the corrections of the head's pose have a mean of zero, in the head's own frame. With one camera, heads
-    and Gaussians otherwise move away from the camera together, which shows from the side."""
+    """Whether corrections of the head's pose have a mean of zero. With one camera, heads and Gaussians otherwise move
+    away from the camera together, which shows from the side."""
     keep_turns: bool = False
-    """Whether what follows the head's turns is removed from the corrections of its pose. A head that is too deep
-    otherwise turns less, which a front camera hardly sees and which shows from the side. It is used only with one
-    camera."""
+    """Whether what follows the head's turns is removed from these corrections, with one camera. A head that is too deep
+    otherwise turns less, which shows from the side."""
     within_bounds: bool = False
-    """Whether expression coefficients stay within the face model's bounds. Those that were tracked beyond a bound may
-    stay there."""
+    """Whether expression coefficients stay within the face model's bounds, or where they were tracked."""
 
     def slowed(self, share: float) -> "FaceTuning":
         """These settings with a share of all learning rates."""
         names = ("expression", "joints", "head_rotation", "head_translation")
-        return replace(self, **{name: getattr(self, name).scaled(share) for name in names})
+        return replace(self, **{name: share * getattr(self, name) for name in names})
 
 
-@dataclass(frozen=True)
-class DensityRules:
-    """A switch for each rule of gradient-based density control. Each says what happens while it is on."""
-
-    clone: bool = True
-    """Small Gaussians with strong gradients are duplicated."""
-    split: bool = True
-    """Large Gaussians with strong gradients are split in two."""
-    prune_faint: bool = True
-    """Gaussians below `prune_opacity` are removed."""
-    prune_large: bool = True
-    """Gaussians above `prune_size` are removed."""
-    prune_wide: bool = True
-    """Gaussians above `prune_radius` on screen are removed. A `prune_radius` of 0 removes none."""
-    reset_opacities: bool = True
-    """Opacities are lowered at `opacity_resets`. The first of these times still sets when pruning by size begins."""
-    never_empty: bool = True
-    """Gaussians that the method protects are not removed (GaussianAvatars: the last one of each triangle)."""
-    cap: bool = True
-    """Growth stops at `max_gaussians`."""
+DensityRule = Literal[
+    "clone", "split", "prune_faint", "prune_large", "prune_wide", "reset_opacities", "never_empty", "cap"
+]
+"""A rule of gradient-based density control: duplicate small and split large Gaussians; remove faint ones, large ones
+(`prune_size`) and those that are wide on screen (`prune_radius`); lower opacities (the first of `opacity_resets` still
+sets when pruning by size begins); keep what the method protects (GaussianAvatars: the last one of each triangle); stop
+at `max_gaussians`."""
 
 
 @dataclass(frozen=True)
@@ -160,32 +212,24 @@ class GradientSettings:
     rounds: Annotated[int, COUNT_OR_NONE] = 16
     """Number of rounds, evenly spread from `start` to `stop`. With 0, the number of Gaussians never changes."""
     grow_gradient: Annotated[float, NOT_NEGATIVE] = 2e-4
-    """Gaussians are duplicated or split if the mean gradient with respect to their centre, in normalised device
-    coordinates, reaches this."""
+    """Mean gradient by the centre, in normalised device coordinates, from which Gaussians grow."""
     size_unit: Literal["metres", "extent"] = "metres"
-    """Unit of `split_size` and `prune_size`: metres, or the extent of the training cameras (docs/paper_preset.md)."""
+    """Unit of `split_size` and `prune_size`: metres, or the extent of the cameras (docs/paper_preset.md)."""
     split_size: Annotated[float, NOT_NEGATIVE] = 0.0025
-    """Gaussians that grow are split in two if they are larger than this, in `size_unit`, and duplicated otherwise."""
-    prune_opacity: Annotated[float, FRACTION] = 0.005
-    """Gaussians below this opacity are removed."""
+    """Size above which Gaussians that grow are split in two, and below which they are duplicated."""
     prune_size: Annotated[float, NOT_NEGATIVE] = 0.1
-    """Gaussians larger than this, in `size_unit`, are removed. This begins with the first opacity reset after
-    `start`, or at `size_start`."""
+    """Size above which Gaussians are removed, from `size_start` on."""
     prune_radius: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Gaussians with a larger radius on screen than this, in pixels, are removed. This begins with the first opacity
-    reset after `start`, or at `size_start`. 0 removes none."""
+    """Radius on screen in pixels above which Gaussians are removed, from `size_start` on. 0 removes none."""
     size_start: Annotated[float | None, FRACTION] = None
-    """Time after which Gaussians are removed by their size, as a fraction of the run. If it is not given, this begins
-    with the first opacity reset after `start`."""
+    """Time after which sizes are pruned, as a fraction of the run. By default, the first opacity reset after
+    `start`."""
     opacity_resets: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = (0.1, 0.4)
-    """Times at which opacities are lowered to `reset_opacity`, as fractions of the run."""
-    reset_opacity: Annotated[float, Range(1e-6, 1)] = 0.01
-    """Highest opacity that remains after a reset."""
+    """Times at which opacities are lowered, as fractions of the run."""
     max_gaussians: Annotated[int, GAUSSIAN_COUNT] = 40_000
-    """Largest number of Gaussians. Growth stops there; Gaussians with the largest gradients grow first. Fills of sides
-    that no picture shows do not count."""
-    rules: DensityRules = field(default_factory=DensityRules)
-    """A switch for each rule."""
+    """Largest number of Gaussians, but for fills. Those with the largest gradients grow first."""
+    rules_off: tuple[DensityRule, ...] = ()
+    """Rules that are switched off (docs/settings.md)."""
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,17 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Int, Shaped
 from torch import Tensor, nn
 
 from mien.adam import FactoredMoments, Moments
+
+
+def as_array(tensor: Tensor) -> Shaped[np.ndarray, "..."]:
+    """A copy of a tensor as a contiguous array: float32 for floating point, int32 for everything else."""
+    return np.array(tensor.detach().cpu().numpy(), np.float32 if tensor.is_floating_point() else np.int32, order="C")
 
 
 class GaussianStore(nn.Module):
@@ -41,6 +47,10 @@ class GaussianStore(nn.Module):
     def names(self) -> tuple[str, ...]:
         """Names of all tensors, trained ones first."""
         return (*self.trained.keys(), *self.fixed_names)
+
+    def arrays(self) -> dict[str, Shaped[np.ndarray, "..."]]:
+        """Copies of all tensors for records of `mien.runtime`."""
+        return {name: as_array(self[name]) for name in self.names()}
 
     def select(self, kept: Tensor) -> None:
         """Keep only the Gaussians that a bool mask [n] selects, or those at the given indices, in that order."""

@@ -9,8 +9,7 @@ import tyro
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.settings import Split, TrainSettings, check_held_out
+from mien.training.settings import AlignmentSettings, Split, TrainSettings, check_held_out
 
 _SPLITS = ("blocks", "tail", "none")
 

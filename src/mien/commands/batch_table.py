@@ -25,8 +25,7 @@ from mien.disk.tables import table_rows, text_of, with_point
 from mien.disk.workspace import check_no_workspace
 from mien.errors import UserError
 from mien.tracking.settings import ScoringSettings, TrackingSettings
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.settings import TrainSettings
+from mien.training.settings import AlignmentSettings, TrainSettings
 
 _MAX_TABLE_BYTES = 64 << 20
 _VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})

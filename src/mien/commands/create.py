@@ -14,11 +14,8 @@ from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
 from mien.machine.progress import Overall
 from mien.tracking.settings import ScoringSettings, TrackingSettings
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.settings import PRESETS, TrainSettings
-from mien.training.splits.benchmark import BENCHMARK_SPLIT
-from mien.training.splits.named import NAMED_SPLIT
-from mien.training.splits.own import OWN_SPLIT
+from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
+from mien.training.settings.splits import SPLITS
 
 
 @dataclass(frozen=True)
@@ -62,14 +59,11 @@ class Command:
         self.options.check()
         if self.view:
             check_viewer()
-        if (split := self.options.settings().split) in (NAMED_SPLIT, BENCHMARK_SPLIT):
-            count = "ten sequences" if split == NAMED_SPLIT else "several sequences"
+        if needs := SPLITS[split := self.options.settings().split].needs:
             raise UserError(
-                f"--split {split}: needs {count} of calibrated cameras, and this command makes one; use "
-                f"`mien capture --calibration` for each, then `mien track` and `mien train --split {split}`"
+                f"--split {split}: needs {needs}, and this command makes one sequence; use `mien capture` for each or "
+                f"`mien import`, then `mien track` and `mien train --split {split}`"
             )
-        if self.options.settings().split == OWN_SPLIT:
-            raise UserError(f"--split {OWN_SPLIT}: is the split of an imported dataset; use it with `mien train`")
         if self.track_apart and not self.options.hold_out:
             raise UserError("--track-apart: needs the sequences to track apart; add --hold-out NAME")
         if self.calibration is None:

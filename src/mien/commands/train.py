@@ -9,9 +9,7 @@ import tyro
 from mien.commands.parsing.options import TrainOptions, check_viewer
 from mien.disk.workspace import open_workspace
 from mien.training.settings import check_held_out
-from mien.training.splits.benchmark import BENCHMARK_SPLIT
-from mien.training.splits.named import NAMED_SPLIT, NamedSplit, split_by_name, with_named_split
-from mien.training.splits.own import OWN_SPLIT
+from mien.training.settings.splits import SPLITS, Recordings, fill_in
 
 
 @dataclass(frozen=True)
@@ -35,39 +33,25 @@ class Command:
         self.options.check()
         if self.view:
             check_viewer()
-        workspace, settings = open_workspace(self.workspace), self.options.settings()
+        settings = self.options.settings()
         run_name(self.run_name or self.options.method)
-        names = workspace.pick_tracked(self.sequences, self.options.hold_out)
-        if settings.split == NAMED_SPLIT:
-            split = self._named_split(names)
-            names, settings = list(split.sequences), with_named_split(settings, split)
-        check_held_out(names, settings)
+        given = self._given()
+        check_held_out(SPLITS[settings.split].used(given), fill_in(settings, given))
 
     def run(self) -> None:
         """Train the run to its end."""
         from mien.pipeline.names import run_name
-        from mien.pipeline.train import (
-            fill_in_benchmark_split,
-            fill_in_named_split,
-            fill_in_own_split,
-            run_training_stage,
-        )
+        from mien.pipeline.train import fill_in_split, run_training_stage
         from mien.training.run import check_run
 
         workspace = open_workspace(self.workspace)
         method, settings = self.options.method_config(), self.options.settings()
         run = run_name(self.run_name or self.options.method)
-        names = workspace.pick_tracked(self.sequences, self.options.hold_out)
-        if settings.split == NAMED_SPLIT:
-            split = self._named_split(names)
-            names, settings = list(split.sequences), fill_in_named_split(workspace, settings, split)
-        if settings.split == BENCHMARK_SPLIT:
-            settings = fill_in_benchmark_split(workspace, settings, names)
-        if settings.split == OWN_SPLIT:
-            settings = fill_in_own_split(workspace, settings, names)
+        names, settings = fill_in_split(workspace, settings, self._given())
         check_run(workspace.run_dir(run), method, settings, names)
         self.options.say_what_is_ignored()
         run_training_stage(workspace, names, run, method, settings, self.view)
 
-    def _named_split(self, names: list[str]) -> NamedSplit:
-        return split_by_name(names, self.workspace.resolve().name, self.options.subject)
+    def _given(self) -> Recordings:
+        names = open_workspace(self.workspace).pick_tracked(self.sequences, self.options.hold_out)
+        return Recordings(dict.fromkeys(names), self.workspace.resolve().name, self.options.subject)

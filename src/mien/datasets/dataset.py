@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import mien.capture.capture
     import mien.face
     import mien.tracking.tracking
-    import mien.training.splits.own
+    import mien.training.settings.splits
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class TrackedSequence:
     tracking: "mien.tracking.tracking.Tracking"
     face_model: "mien.face.FaceModel"
     """The face model that the tracking's parameters belong to."""
-    own_split: "mien.training.splits.own.OwnSplit | None" = None
+    own_split: "mien.training.settings.splits.OwnSplit | None" = None
     """Timesteps and cameras that the dataset's authors hold out. None if they name no split."""
     foreign: "Mapping[str, numpy.ndarray]" = field(default_factory=dict)
     """Arrays for which mien has no place, such as coefficients of a model that nobody can ship. They are kept beside
@@ -41,7 +41,7 @@ class FilmedSequence:
     """One sequence of a dataset without a face that mien can use: pictures, cameras, mattes and landmarks."""
 
     capture: "mien.capture.capture.Capture"
-    own_split: "mien.training.splits.own.OwnSplit | None" = None
+    own_split: "mien.training.settings.splits.OwnSplit | None" = None
     foreign: "Mapping[str, numpy.ndarray]" = field(default_factory=dict)
 
 
@@ -61,7 +61,7 @@ class Footage:
     It raises UserError if they are damaged. None if there are none."""
     stride: int = 1
     """Take every n-th frame."""
-    own_split: "mien.training.splits.own.OwnSplit | None" = None
+    own_split: "mien.training.settings.splits.OwnSplit | None" = None
     files: "Mapping[str, bytes]" = field(default_factory=dict)
     """Files to keep beside the capture, by name."""
 

@@ -163,7 +163,7 @@ def _face(clip: _Clip, model: "FaceModel") -> "FaceParams":
 def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.datasets.flame_poses import FRONT, camera_of
     from mien.datasets.sequences import sequence_of
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
     clips = _clips(path)
     held = _held_out(clips)

@@ -36,7 +36,7 @@ from mien.machine.terminal import counted
 
 if TYPE_CHECKING:
     from mien.face.model import FaceModel
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
 _FPS = 25.0
 TEST_FRAMES = {"INSTA": 350, "FlashAvatar": 500, "NeRFBlendShape": 500}
@@ -216,7 +216,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
 
 
 def _own_split(layout: _Layout) -> "OwnSplit | None":
-    from mien.training.splits.own import OwnSplit, ranges_of
+    from mien.training.settings.splits import OwnSplit, ranges_of
 
     return OwnSplit(ranges_of(list(layout.test))) if layout.test else None
 

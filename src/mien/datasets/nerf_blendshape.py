@@ -85,7 +85,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.flame_poses import FRONT, camera_of, pinhole, viewmats_from_opengl
     from mien.datasets.pictures import read_one_camera, read_picture
     from mien.datasets.sequences import filmed_sequence
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
     file = path / _FILE
     content, numbered = _frames(path)

@@ -122,7 +122,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.datasets.flame_poses import FRONT, camera_of
     from mien.datasets.pictures import read_one_camera
     from mien.datasets.sequences import filmed_sequence
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
     plate = next(iter(_plates(path)), None)
     if plate is not None:

@@ -15,12 +15,12 @@ from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.datasets.nersemble import FRONTAL, frames_in, has_mattes, read_cameras
 from mien.errors import UserError
-from mien.training.splits.benchmark import HIDDEN_CAMERAS
+from mien.training.settings.splits import HIDDEN_CAMERAS
 
 if TYPE_CHECKING:
     from mien.camera import Camera
     from mien.face.model import FaceModel
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
 VERSION = "FLAME 2023 (flame2023.pkl)"
 TRACKING = "flame2023_tracking_v2.npz"
@@ -144,7 +144,7 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
 
 def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
     """The split of a folder that `mien export` wrote, whose held-out frames are a sequence of their own."""
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
     if folder.name.endswith(TEST_ENDING):
         return OwnSplit(((0, timesteps),))

@@ -18,7 +18,7 @@ from mien.datasets.nersemble_benchmark import FPS_MONO, FPS_VIEWS, TRACKING, VER
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.training.splits.benchmark import HIDDEN_CAMERAS, TEST_CAMERAS, TEST_SEQUENCES, TRAINING_CAMERA
+from mien.training.settings.splits import HIDDEN_CAMERAS, TEST_CAMERAS, TEST_SEQUENCES, TRAINING_CAMERA
 
 MONO_PEOPLE = ("393", "404", "461", "477", "486")
 VIEW_PEOPLE = ("388", "422", "443", "445", "475")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mien.camera import Camera
     from mien.datasets.dataset import TrackedSequence
     from mien.face.model import FaceModel
-    from mien.training.splits.own import OwnSplit
+    from mien.training.settings.splits import OwnSplit
 
 _VERSION = "FLAME 2023 (flame2023.pkl) with GaussianAvatars' teeth"
 _WHOLE, _TRAIN = "transforms.json", "transforms_train.json"
@@ -106,7 +106,7 @@ def _group(path: Path, name: str, frames: dict[tuple[int, str], _Frame]) -> _Gro
 
 def _own_split(group: _Group) -> "OwnSplit | None":
     """Whole timesteps and cameras that transforms_train.json does not list."""
-    from mien.training.splits.own import OwnSplit, ranges_of
+    from mien.training.settings.splits import OwnSplit, ranges_of
 
     trained = {key for key, frame in group.frames.items() if frame.trained}
     by_time = {timestep for timestep, _ in trained}

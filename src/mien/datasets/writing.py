@@ -18,7 +18,7 @@ from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.training.footage.clothes import FOREIGN
 from mien.training.footage.sequence import read_sequence
-from mien.training.splits.own import write_own_split
+from mien.training.settings.splits import write_own_split
 
 OVERLAY = "tracking/overlay.png"
 """File in a sequence's folder: the imported mesh over some of its pictures."""

@@ -15,7 +15,7 @@ from mien.evaluation.metrics import psnr
 from mien.evaluation.scoring import as_8_bit
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import render_mesh
-from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.mesh_colors import vertex_colors
 
 
@@ -63,7 +63,7 @@ def make_baselines(
 ) -> Baselines:
     """Both baselines, from training frames only. `means` are those of `look_at_trained`, if they are known."""
     model, frames = experiment.avatar.face_model, experiment.training_frames
-    colors = vertex_colors(model, experiment.sequences, experiment.faces, frames, threads)
+    colors = vertex_colors(Footage(model, experiment.sequences, experiment.faces, frames), threads)
     return Baselines(look_at_trained(experiment, 0, threads)[0] if means is None else means, colors)
 
 

@@ -10,9 +10,7 @@ from mien.evaluation.scoring import ScoreSettings, lpips_metric
 from mien.tracking.scoring import Scoring
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
-from mien.training.splits.benchmark import BENCHMARK_SPLIT, TEST_CAMERAS
-from mien.training.splits.named import NAMED_SPLIT
-from mien.training.splits.own import OWN_SPLIT, imported_from
+from mien.training.settings.splits import BENCHMARK_SPLIT, NAMED_SPLIT, OWN_SPLIT, TEST_CAMERAS, imported_from
 
 _ALEX, _VGG = "lpips-alex", "lpips-vgg"
 

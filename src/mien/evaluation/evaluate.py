@@ -26,8 +26,8 @@ from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
 from mien.perceptual.lpips import load_lpips
+from mien.training.colors import GAINS
 from mien.training.footage.filmed import read_coverage
-from mien.training.frame_gains import GAINS
 from mien.training.run import read_curves, read_run_config, read_training_summary, run_camera
 
 _RECIPE = 4  # version of the scoring. It is raised whenever the same frame would get other figures

@@ -20,11 +20,11 @@ from mien.render.closing import close_holes
 from mien.render.rendering import Rendering
 from mien.render.validation import drawable
 from mien.tracking.scoring import Scoring
+from mien.training.colors import lit
 from mien.training.footage.clothes import clothes_mask
 from mien.training.footage.foreground import foreground_colors
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence, composite
-from mien.training.frame_gains import lit
 
 FaceSource = Literal["as_tracked", "corrected"]
 """Face parameters of held-out frames: as the tracker left them, or corrected by what training changed in neighbouring

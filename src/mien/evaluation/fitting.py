@@ -8,15 +8,14 @@ right. It uses the pixels that are scored, so it is no figure of a prediction, a
 import torch
 
 from mien.avatar.avatar import frozen
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import FaceTuning
+from mien.avatar.settings import FaceTuning, Progress
 from mien.evaluation.experiment import Experiment, target_image
 from mien.face.params import FaceParams
 from mien.render import rasterize
 from mien.training.adam import Adam
-from mien.training.face_track import FaceTrack
+from mien.training.footage.face_track import FaceTrack
 from mien.training.footage.frames import Frame
-from mien.training.photometric import photometric_loss
+from mien.training.losses import photometric_loss
 
 LOSS = "mean absolute difference of colours over the whole picture"
 _RATES = FaceTuning(within_bounds=True)

@@ -17,10 +17,10 @@ from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.tracking.scoring_files import read_scoring, read_scoring_hash
+from mien.training.colors import read_gains
 from mien.training.footage.clothes import clothes_digest, read_clothes
 from mien.training.footage.frames import Frame, held_out_of, training_frames
 from mien.training.footage.sequence import Sequence, sequence_of
-from mien.training.frame_gains import read_gains
 from mien.training.run import check_data, read_face_track, read_run_config
 from mien.training.settings import TrainSettings
 

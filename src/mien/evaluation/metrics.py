@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from mien.media.pictures import Box
-from mien.training.photometric import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
+from mien.training.losses import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 
 Border = Literal["zeros", "inside"]
 """Windows of SSIM at the border of a picture: with zeros beyond it, or only those that lie inside."""

@@ -22,10 +22,9 @@ from mien.rotation import axis_angle_from_matrix
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.tracking import Tracking
 from mien.training.alignment import align
-from mien.training.alignment_settings import AlignmentSettings
 from mien.training.footage.sequence import Sequence
 from mien.training.run import outdated_sequences
-from mien.training.settings import TrainSettings
+from mien.training.settings import AlignmentSettings, TrainSettings
 
 _RECIPE = 3
 """Version of the alignment. It is raised whenever the same tracking would be aligned differently."""

@@ -17,7 +17,7 @@ from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.text import dataset_line, driven_line, protocol_lines
 from mien.machine.progress import say
 from mien.training.run import read_run_config
-from mien.training.splits.named import DRIVING, NAMED_SPLIT, driving_sequences
+from mien.training.settings.splits import DRIVING, NAMED_SPLIT, driving_sequences
 
 
 def run_evaluation_stage(

@@ -9,8 +9,7 @@ from mien.errors import UserError
 from mien.machine.progress import Piece
 from mien.media.video import probe_video
 from mien.tracking.settings import TrackingSettings
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.settings import TrainSettings
+from mien.training.settings import AlignmentSettings, TrainSettings
 
 _FIND, _CAPTURE, _LANDMARKS, _PIXELS, _SCORING, _OVERLAY = 0.005, 0.036, 0.062, 0.07, 0.015, 0.055
 _SHARED_PIXELS = 10.0

@@ -34,14 +34,14 @@ from mien.machine.progress import say, track_progress
 from mien.machine.terminal import counted
 from mien.media.pictures import to_uint8
 from mien.media.video import write_video
-from mien.pipeline.train import fill_in_own_split, read_together
+from mien.pipeline.train import fill_in_split, read_together
 from mien.render import rasterize
 from mien.render.closing import close_holes
 from mien.render.validation import drawable
 from mien.tracking.files import read_tracking
 from mien.training.run import check_data, read_face_track, read_run_config
 from mien.training.settings import Split, TrainSettings
-from mien.training.splits.own import OWN_SPLIT, read_own_split
+from mien.training.settings.splits import OWN_SPLIT, Recordings, read_own_split
 
 
 def settings_of(workspace: Workspace, sequence: str, run: str | None, split: Split | None) -> TrainSettings:
@@ -62,7 +62,7 @@ def settings_of(workspace: Workspace, sequence: str, run: str | None, split: Spl
     own = read_own_split(workspace.sequence_dir(sequence))
     chosen = split or (OWN_SPLIT if own is not None else TrainSettings().split)
     settings = replace(TrainSettings(), split=chosen)
-    return fill_in_own_split(workspace, settings, [sequence]) if chosen == OWN_SPLIT else settings
+    return fill_in_split(workspace, settings, Recordings({sequence: None}))[1]
 
 
 def export_capture(

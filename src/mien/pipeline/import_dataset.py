@@ -31,7 +31,7 @@ from mien.pipeline.names import check_new_run, check_new_sequence
 from mien.pipeline.track import run_tracking_stage
 from mien.tracking.settings import TrackingSettings
 from mien.training.run import BUSY_REMEDY, write_imported_run
-from mien.training.splits.own import write_own_split
+from mien.training.settings.splits import write_own_split
 
 _DISTANCE = 1.2
 """Distance of the camera from the middle of the head, in metres."""

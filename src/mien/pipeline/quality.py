@@ -49,10 +49,9 @@ from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
-from mien.training.alignment_settings import AlignmentSettings
 from mien.training.footage.frames import Frame
 from mien.training.run import read_training_summary
-from mien.training.settings import PRESETS, TrainSettings
+from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 
 _FORMAT, _VERSION = "mien.bench_quality", 1
 _TIMES = "seconds.json"

@@ -1,6 +1,7 @@
 """From sequences to a run, as the command line runs it."""
 
 from contextlib import ExitStack
+from dataclasses import replace
 
 from mien.avatar.settings import MethodConfig
 from mien.capture.store import read_capture
@@ -9,52 +10,32 @@ from mien.disk.workspace import Workspace
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.machine.progress import say
-from mien.machine.terminal import counted
 from mien.pipeline.live_view import LiveView
 from mien.training.footage.sequence import Sequence, read_sequence
 from mien.training.run import check_untouched, is_finished, read_training_summary
 from mien.training.settings import TrainSettings
-from mien.training.splits.benchmark import with_benchmark_split
-from mien.training.splits.named import NamedSplit, with_named_split
-from mien.training.splits.own import read_own_split, with_own_split
+from mien.training.settings.splits import SPLITS, Recorded, Recordings, fill_in, read_own_split
 from mien.training.trainer import check_trackings, train
 
 
-def fill_in_named_split(workspace: Workspace, settings: TrainSettings, split: NamedSplit) -> TrainSettings:
-    """The settings with what a named split holds out, after a message that says so."""
-    cameras = {name: read_capture(workspace.sequence_dir(name) / "capture").camera_ids for name in split.sequences}
-    settings = with_named_split(settings, split, cameras)
-    left_out = f"; not used: {', '.join(split.left_out)}" if split.left_out else ""
-    say(
-        f"subject {split.subject} of GaussianAvatars: held out are the sequence {split.held_out} and camera "
-        f"{', '.join(settings.held_out_cameras)}{left_out}"
-    )
-    return settings
-
-
-def fill_in_benchmark_split(workspace: Workspace, settings: TrainSettings, names: list[str]) -> TrainSettings:
-    """The settings with what the NeRSemble benchmark holds out, after a message that says so."""
-    cameras = {name: read_capture(workspace.sequence_dir(name) / "capture").camera_ids for name in names}
-    settings = with_benchmark_split(settings, names, cameras)
-    parts = {"sequences": settings.held_out_sequences, "cameras": settings.held_out_cameras}
-    words = [f"the {kind} {', '.join(part)}" for kind, part in parts.items() if part]
-    say(f"the benchmark's split: held out are {' and '.join(words)}")
-    return settings
-
-
-def fill_in_own_split(workspace: Workspace, settings: TrainSettings, names: list[str]) -> TrainSettings:
-    """The settings with the sequences and cameras that the dataset's authors held out, after a message that says so."""
-    splits = {name: read_own_split(workspace.sequence_dir(name)) for name in names}
-    timesteps = {name: read_capture(workspace.sequence_dir(name) / "capture").timesteps for name in names}
-    settings = with_own_split(settings, splits, timesteps)
-    parts = [counted(len(settings.held_out_sequences), "sequence"), counted(len(settings.held_out_cameras), "camera")]
-    frames = sum(
-        split is not None and name not in settings.held_out_sequences and split.holds_out(timestep)
-        for name, split in splits.items()
-        for timestep in range(timesteps[name])
-    )
-    say(f"the dataset's own split: held out are {', '.join(parts)}, and {counted(frames, 'timestep')} of the others")
-    return settings
+def fill_in_split(workspace: Workspace, settings: TrainSettings, given: Recordings) -> tuple[list[str], TrainSettings]:
+    """The sequences that a run uses, and its settings with what the split holds out, after a message that says so."""
+    rule = SPLITS[settings.split]
+    names = rule.used(given)
+    if rule.held_out is None:
+        return names, settings
+    recorded = {}
+    for name in names:
+        folder = workspace.sequence_dir(name)
+        capture = read_capture(folder / "capture")
+        recorded[name] = Recorded(capture.camera_ids, capture.timesteps, read_own_split(folder))
+    settings = fill_in(settings, replace(given, sequences=recorded))
+    parts = {"sequence": settings.held_out_sequences, "camera": settings.held_out_cameras}
+    words = [f"the {kind}{'s' * (len(part) > 1)} {', '.join(part)}" for kind, part in parts.items() if part]
+    left_out = [name for name in given.sequences if name not in names]
+    not_used = f"; not used: {', '.join(left_out)}" if left_out else ""
+    say(f"--split {settings.split}: held out are {' and '.join(words) or 'timesteps of each sequence'}{not_used}")
+    return names, settings
 
 
 def read_together(workspace: Workspace, names: list[str]) -> tuple[list[Sequence], FaceModel]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from mien import _native
 from mien.adam import BETA1, BETA2, EPSILON, FactoredMoments
 from mien.arrays import unpacked
 from mien.avatar.avatar import ParameterGroup
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import Moments
 
 
@@ -33,16 +33,8 @@ class FactoredUpdate(NamedTuple):
     values: Float[Tensor, "n k f"]
     terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]
     """Rows and columns of the gradient (`mien.adam.FactoredGradient`)."""
-    moments: FactoredMoments
-    rate: float
-
-
-class FactoredAdamUpdate(NamedTuple):
-    """The same by Adam as published, with two running means of every number."""
-
-    values: Float[Tensor, "n k f"]
-    terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]
-    moments: Moments
+    moments: Moments | FactoredMoments
+    """Of Adam as published, with two running means of every number, or one second moment for all k."""
     rate: float
 
 
@@ -52,8 +44,8 @@ _State = TypeVar("_State", Moments, FactoredMoments)
 class Adam:
     """Adam (Kingma and Ba 2015) with the constants of 3D Gaussian Splatting. One native call updates all tensors.
 
-    A tensor with a factored gradient has an update of its own (`factored_update`, `factored_adam_update`). The state
-    of per-Gaussian tensors is in their store, that of networks is here.
+    A tensor with a factored gradient has an update of its own. The state of per-Gaussian tensors is in their store,
+    that of networks is here.
     """
 
     def __init__(self) -> None:
@@ -68,7 +60,8 @@ class Adam:
                 if name in group.factored:
                     terms = group.factored[name].take()
                     if terms and rate > 0:
-                        self._update_by_factors(group, name, tensor, terms, rate)
+                        state = self._state(group, name, tensor, group.factored_moments)
+                        factored_update(FactoredUpdate(tensor, terms, state, rate))
                     continue
                 gradient = tensor.grad
                 if gradient is None:
@@ -78,19 +71,6 @@ class Adam:
                     state = self._state(group, name, tensor, Moments)
                     updates.append(Update(tensor, gradient, state, rate, group.epsilon))
         update_all(updates)
-
-    def _update_by_factors(
-        self,
-        group: ParameterGroup,
-        name: str,
-        tensor: Tensor,
-        terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]],
-        rate: float,
-    ) -> None:
-        if group.factored_moments is Moments:
-            factored_adam_update(FactoredAdamUpdate(tensor, terms, self._state(group, name, tensor, Moments), rate))
-        else:
-            factored_update(FactoredUpdate(tensor, terms, self._state(group, name, tensor, FactoredMoments), rate))
 
     def state(self) -> dict[str, Moments | FactoredMoments]:
         """The state of all tensors that have no store, by group and tensor."""
@@ -116,11 +96,12 @@ def update_all(updates: Sequence[Update]) -> None:
     """Apply all updates in place: natively if tensors are float32, contiguous and on a CPU, with mien's `EPSILON`."""
     tasks = []
     for update in updates:
-        task = _native_task(update)
-        if task is None:
-            update_reference(update)
+        values, gradient, moments, rate, epsilon = update
+        arrays = (values, gradient, moments.first, moments.second, moments.step)
+        if epsilon == EPSILON and _fit_core(arrays):
+            tasks.append((*unpacked(*arrays), rate))
         else:
-            tasks.append(task)
+            update_reference(update)
     if tasks:
         _native.adam_update(tasks)
 
@@ -137,50 +118,50 @@ def update_reference(update: Update) -> None:
     values.addcdiv_(moments.first, denominator, value=-rate / (1 - BETA1**step))
 
 
-def _native_task(update: Update) -> tuple[Any, Any, Any, Any, Any, float] | None:
-    """The update in the form that the core takes, or None if it cannot take these tensors."""
-    values, gradient, moments, rate, epsilon = update
-    if epsilon != EPSILON:  # that of the core
-        return None
-    arrays = (values, gradient, moments.first, moments.second, moments.step)
-    return (*unpacked(*arrays), rate) if _fit_core(arrays) else None
-
-
 def _fit_core(tensors: Iterable[Tensor]) -> bool:
     return all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in tensors)
 
 
 def _whole(terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]) -> Float[Tensor, "n k f"]:
-    """The gradient that terms stand for."""
     gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
     assert isinstance(gradient, Tensor)
     return gradient
 
 
 def factored_update(update: FactoredUpdate) -> None:
-    """Apply an update in place: natively if tensors are float32, contiguous and on a CPU.
+    """Apply an update in place: natively, without making the gradient, if tensors are float32, contiguous, on a CPU.
 
-    It is Adam's without the running mean of the gradient, and with one second moment for all k: the running mean of the
-    squared gradient's mean over k (the idea of Adafactor, Shazeer and Stern 2018). A row whose gradient is 0 keeps its
-    values and its state, and a column that is 0 changes nothing. So the tensor is read and written once, where it
-    changes, and its state is smaller by the number of columns.
+    With `FactoredMoments` it is Adam's without the running mean of the gradient, and with one second moment for all k:
+    the running mean of the squared gradient's mean over k (the idea of Adafactor, Shazeer and Stern 2018). A row whose
+    gradient is 0 keeps its values and its state, and a column that is 0 changes nothing. So the tensor is read and
+    written once, where it changes, and its state is smaller by the number of columns.
+
+    With `Moments` and one term, it has the bits of `update_all` with the whole gradient, which would be the largest
+    tensor of a step. Only numbers below 1.2e-38 differ: they become 0, because running means that fade would be slow.
     """
-    moments = update.moments
-    terms = [(rows, columns.detach()) for rows, columns in update.terms]
-    arrays = (update.values.detach(), moments.second, moments.weights)
-    every = (*arrays, *(tensor for term in terms for tensor in term))
-    if _fit_core(every):
-        values, second, weights = unpacked(*arrays)
+    values, terms, moments, rate = update
+    terms = [(rows, columns.detach()) for rows, columns in terms]
+    factored = isinstance(moments, FactoredMoments)
+    state = (moments.second, moments.weights) if factored else (moments.first, moments.second, moments.step)
+    arrays = (values.detach(), *state)
+    if _fit_core((*arrays, *(tensor for term in terms for tensor in term))):
+        native_values, *native_state = unpacked(*arrays)
         rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
-        _native.factored_update(values, rows, columns, second, weights, update.rate)
-        return
-    factored_update_reference(update)
+        apply = _native.factored_update if factored else _native.factored_adam_update
+        apply(native_values, rows, columns, *native_state, rate)
+    elif factored:
+        factored_update_reference(update)
+    else:
+        with torch.no_grad():
+            gradient = _whole(terms)
+        update_reference(Update(values, gradient, moments, rate))
 
 
 @torch.no_grad()
 def factored_update_reference(update: FactoredUpdate) -> None:
-    """`factored_update` in plain PyTorch, any number of terms, dtype and device."""
+    """`factored_update` with `FactoredMoments` in plain PyTorch, any number of terms, dtype and device."""
     values, terms, moments, rate = update
+    assert isinstance(moments, FactoredMoments)
     gradient = _whole(terms)
     squares = gradient.square().mean(1)
     touched = (gradient != 0).flatten(1).any(1)
@@ -191,23 +172,3 @@ def factored_update_reference(update: FactoredUpdate) -> None:
     weights = torch.where(touched, moments.weights, torch.ones_like(moments.weights))
     deviations = (moments.second / weights[:, None]).sqrt() + EPSILON
     values.sub_(rate * gradient / deviations[:, None])
-
-
-def factored_adam_update(update: FactoredAdamUpdate) -> None:
-    """Apply an update in place: natively, without making the gradient, if tensors are float32, contiguous, on a CPU.
-
-    With one term, it has the bits of `update_all` with the whole gradient, which would be the largest tensor of a step.
-    Only numbers below 1.2e-38 differ: they become 0, because running means that fade would be slow to compute.
-    """
-    values, terms, moments, rate = update
-    terms = [(rows, columns.detach()) for rows, columns in terms]
-    arrays = (values.detach(), moments.first, moments.second, moments.step)
-    every = (*arrays, *(tensor for term in terms for tensor in term))
-    if _fit_core(every):
-        native_values, first, second, step = unpacked(*arrays)
-        rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
-        _native.factored_adam_update(native_values, rows, columns, first, second, step, rate)
-        return
-    with torch.no_grad():
-        gradient = _whole(terms)
-    update_reference(Update(values, gradient, moments, rate))

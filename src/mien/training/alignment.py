@@ -18,7 +18,6 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar, ParameterGroup, frozen, move_avatar
 from mien.avatar.methods import DEFAULT_METHOD
-from mien.avatar.schedules import Rate
 from mien.avatar.settings import FaceTuning
 from mien.avatar.store import Moments
 from mien.disk.config import overlay
@@ -29,14 +28,13 @@ from mien.face.params import FaceParams, concatenate
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
-from mien.training.alignment_settings import AlignmentSettings
-from mien.training.face_track import FaceTrack, corrected_poses, pose_corrections
+from mien.training.colors import lit, read_gains
+from mien.training.footage.face_track import FaceTrack, corrected_poses, pose_corrections
 from mien.training.footage.frames import Frame, evenly_spread, training_frames
 from mien.training.footage.sequence import Sequence, Target, Targets
-from mien.training.frame_gains import lit, read_gains
-from mien.training.photometric import photometric_loss
+from mien.training.losses import photometric_loss
 from mien.training.run import read_face_track
-from mien.training.settings import PRESETS, TrainSettings
+from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 from mien.training.trainer import ProgressBar, train
 
 ALIGNED_TOGETHER = 4  # number of timesteps that are aligned in one pass
@@ -83,18 +81,8 @@ def align(
     """Train a template and align all frames of some sequences of one subject to it.
 
     Identity and offsets of the mesh stay. So does the mean of head poses, as Gaussians and poses could move together.
-
-    Args:
-        sequences: The sequences. `training` says what of them is held out.
-        face_model: The face model that they were tracked with.
-        settings: Settings of the template and of the alignment.
-        training: Settings of the run that the alignment is for. Its split, seed, device and threads are used.
-        folder: Where the template is trained, and the frames that are aligned are kept. What was stopped continues
-            there. It belongs to these sequences and settings alone.
-        progress: Makes progress bars.
-
-    Returns:
-        The face parameters of each sequence.
+    `training` is of the run that the alignment is for: what is held out, seed and device. The template is trained in
+    `folder`, where aligned frames are kept, too. What was stopped continues there.
     """
     config = overlay(
         PRESETS["draft"].config(DEFAULT_METHOD),
@@ -135,11 +123,7 @@ def steadier(tracked: FaceParams, aligned: FaceParams, trained: Bool[Tensor, " t
 
     Each frame is aligned on its own, which makes heads tremble. A tracking's errors change slowly, so its corrections
     are averaged over three timesteps. Expressions stay, since averaging them costs detail.
-
-    Args:
-        tracked: The face parameters as they were tracked.
-        aligned: The same, aligned.
-        trained: The timesteps that training uses. They take nothing from others, so that no held-out frame moves them.
+    Timesteps that training uses (`trained`) take nothing from others, so that no held-out frame moves them.
     """
     own, places = pose_corrections(tracked, aligned), torch.arange(len(aligned))
 
@@ -166,18 +150,8 @@ def align_faces(
 
     Each timestep descends on its own on L1 and SSIM, for the same number of steps (`FaceDescent`). Timesteps in which
     nothing was found, or in which a hand covers the face, get corrections from their neighbours.
-
-    Args:
-        avatar: The avatar, on the CPU. It is the same afterwards.
-        sequences: The sequences.
-        starts: The face parameters of each sequence to start from.
-        known: The frames that the avatar was trained on. Some of them say how large gradients are, and they alone say
-            what corrections of head poses share.
-        settings: Settings of the descent.
-        held_out_cameras: Ids of cameras that are not looked at.
-        folder: Where timesteps that are aligned are kept, for this call and no other. A stopped call continues there.
-        progress: Makes progress bars.
-        gains: Gain of each timestep of each sequence (`read_gains`). Default: steady light.
+    Some frames of `known`, on which the avatar was trained, say how large gradients are, and they alone say what
+    corrections of head poses share. With a folder, a stopped call continues there.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
     tuning, bounds = _tuning(settings, single), avatar.face_model.expression_bounds
@@ -209,7 +183,6 @@ def align_faces(
 
 
 def _keep(folder: Path | None, track: FaceTrack, indices: list[int]) -> None:
-    """Write the parameters of timesteps that are aligned."""
     if folder is not None:
         each = [_values(track, index) for index in indices]
         write_tensors(folder / _KEPT, {name: torch.stack([values[name] for values in each]) for name in each[0]})
@@ -239,20 +212,17 @@ def _take_up(folder: Path | None, track: FaceTrack, indices: list[int]) -> int:
 
 
 def _values(track: FaceTrack, index: int) -> dict[str, Tensor]:
-    """The parameters of one timestep."""
     groups = track.parameter_groups(index)
     return {f"{group.name}.{name}": tensor for group in groups for name, tensor in group.tensors.items()}
 
 
 def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
-    """How far a step moves each field."""
     rates = (_ALIGNED_EXPRESSION, _ALIGNED_JOINTS, 1.0, _ALIGNED_SHIFT)
-    own = [Rate(settings.rate).scaled(share) for share in rates]
+    own = [share * settings.rate for share in rates]
     return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
 
 
 def _batches(timesteps: list[_Timestep]) -> Iterator[list[_Timestep]]:
-    """The timesteps in parts that are drawn together."""
     for first in range(0, len(timesteps), ALIGNED_TOGETHER):
         yield timesteps[first : first + ALIGNED_TOGETHER]
 
@@ -350,7 +320,6 @@ def _moments(group: ParameterGroup, name: str) -> Moments:
 
 
 def _looked_at(index: int, sequence: Sequence, held_out_cameras: Items[str]) -> Iterator[_Timestep]:
-    """The timesteps of a sequence to align."""
     kept = [camera_id not in held_out_cameras for camera_id in sequence.capture.camera_ids]
     usable = sequence.usable() & sequence.clear() & np.array(kept)
     for timestep in range(sequence.capture.timesteps):

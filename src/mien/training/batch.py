@@ -1,32 +1,104 @@
 """The frames of one optimiser step: which they are, their pictures, and their losses.
 
-Most methods use one frame in a step. Of several, networks of positions run once.
+Most methods use one frame in a step. Of several, networks of positions run once. While a step runs, a worker prepares
+the pictures of the next ones, so that no step waits for a picture.
 """
 
-from collections.abc import Callable, Iterable
+import copy
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as Items
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any, TypeVar
 
+import cv2
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
 from mien.avatar.avatar import ParameterGroup, Posed
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import PerceptualLoss
+from mien.avatar.settings import PerceptualLoss, Progress
 from mien.camera import Camera
 from mien.face.params import concatenate
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
 from mien.render.rendering import Rendering
-from mien.training.ahead import Result, TargetQueue
 from mien.training.checkpoint import TrainingState
-from mien.training.footage.frames import LEAST_EXTENT, Frame, FrameOrder, background_at, crop_random
+from mien.training.footage.frames import CROP, LEAST_EXTENT, BatchFrame, Frame, FrameOrder, background_at, random_at
 from mien.training.footage.sequence import Target, Targets
 from mien.training.losses import PerceptualGoal, perceptual_goal, perceptual_loss, picture_losses
-from mien.training.parts import BatchFrame
 from mien.training.settings import TrainSettings
+
+Result = TypeVar("Result")
+TargetsAt = Callable[[int], Items[Targets]]
+"""Gives the targets of a step, one entry per sequence."""
+
+AHEAD = 4
+"""Number of steps whose pictures are prepared in advance. It bounds the memory: each has 4 bytes a pixel."""
+
+
+class TargetQueue:
+    """The targets of consecutive steps. One worker thread reads and composites those of the next few steps.
+
+    Frame and background of a step are known functions of its number, so a target does not depend on when it is made.
+    """
+
+    def __init__(self, order: FrameOrder, targets: TargetsAt, settings: TrainSettings, worker: ThreadPoolExecutor):
+        # The order remembers the epoch that it was asked for last, and the trainer asks for earlier steps.
+        self._order, self._targets, self._settings, self._worker = copy.copy(order), targets, settings, worker
+        self._next = 0
+        self._waiting: deque[Target | Future[Target]] = deque()
+
+    def target(self, step: int) -> Target:
+        """The target of a step. Ask for the steps in their order; after a jump, the queue starts again."""
+        if step != self._next - len(self._waiting):
+            self.close()
+            self._next = step
+        while self._next <= step + AHEAD and (self._next <= step or self._next < self._settings.steps):
+            self._waiting.append(self._planned(self._next))
+            self._next += 1
+        found = self._waiting.popleft()
+        return found.result() if isinstance(found, Future) else found
+
+    def meanwhile(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Let the worker call a function after the pictures that it was asked for so far."""
+        return self._worker.submit(function, *arguments)
+
+    def close(self) -> None:
+        """Forget the targets that nobody will ask for."""
+        for entry in self._waiting:
+            if isinstance(entry, Future):
+                entry.cancel()
+        self._waiting.clear()
+
+    def _planned(self, step: int) -> Target | Future[Target]:
+        frame, _ = self._order.at(step)
+        targets, background = self._targets(step)[frame.sequence], background_at(self._settings, step)
+        kept = targets.kept(frame.timestep, frame.camera, background)
+        if kept is not None:
+            return kept
+        keep = self._settings.background == "white"
+        return self._worker.submit(targets.composed, frame.timestep, frame.camera, background, keep)
+
+
+@contextmanager
+def targets_ahead(order: FrameOrder, targets: TargetsAt, settings: TrainSettings) -> Iterator[TargetQueue]:
+    """A queue whose worker ends with the block, also after an error. `targets` gives the targets of a step."""
+    cv2_threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # OpenCV's own threads and those of the step would wait for each other.
+    # torch limits the threads of its operations for each thread apart.
+    limit = partial(torch.set_num_threads, torch.get_num_threads())
+    worker = ThreadPoolExecutor(1, thread_name_prefix="mien-targets", initializer=limit)
+    try:
+        yield TargetQueue(order, targets, settings, worker)
+    finally:
+        worker.shutdown(wait=True, cancel_futures=True)
+        cv2.setNumThreads(cv2_threads)
+
 
 LEAST_HALVED = 384  # least longer side of pictures that are halved at the start of a run, in pixels
 
@@ -69,7 +141,7 @@ class TrainingData:
         self, target: Target, perceptual: PerceptualLoss, step: int, settings: TrainSettings
     ) -> Callable[[], PerceptualGoal]:
         """A function that returns the goal of a step's perceptual loss. With `ahead`, it is made meanwhile."""
-        make = partial(perceptual_goal, target, perceptual, crop_random(settings, step))
+        make = partial(perceptual_goal, target, perceptual, random_at(settings.seed, CROP, step))
         return self.meanwhile(make) if target.background.device.type == "cpu" else make
 
     def meanwhile(self, make: Callable[[], Result]) -> Callable[[], Result]:
@@ -93,7 +165,7 @@ def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings
         goal = data.goal(target, perceptual, number, settings) if due else None
         camera = data.targets_at(number)[frame.sequence].camera(frame.camera)
         index = state.track.index_of(frame.sequence, frame.timestep)
-        batch.append(BatchFrame(number, frame, index, camera, target, goal))
+        batch.append(BatchFrame(number, frame, index, state.track.face(index), camera, target, goal))
     return batch
 
 
@@ -101,11 +173,11 @@ def draw(
     state: TrainingState, batch: Items[BatchFrame], progress: Progress
 ) -> tuple[Posed, list[Posed], list[Rendering]]:
     """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
-    faces = [state.track.face(one.index) for one in batch]
+    faces = [one.face for one in batch]
     posed = state.avatar.pose(faces[0] if len(faces) == 1 else concatenate(faces), progress)
     each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
-    for part in state.parts:
-        each = [part.posed(own, one) for one, own in zip(batch, each, strict=True)]
+    if state.head is not None:
+        each = [state.head.posed(own, one) for one, own in zip(batch, each, strict=True)]
     views = [(own.gaussians.timestep(0), one.camera) for one, own in zip(batch, each, strict=True)]
     backgrounds = [one.target.background for one in batch]
     whole = each[0] if len(batch) == 1 else posed
@@ -117,17 +189,15 @@ def draw(
 def seen(state: TrainingState, batch: Items[BatchFrame], renderings: Items[Rendering]) -> list[Rendering]:
     """The pictures as they are compared, for example in the colours of their cameras."""
     shown = list(renderings)
-    for part in state.parts:
-        shown = [part.seen(rendering, one) for one, rendering in zip(batch, shown, strict=True)]
+    for own in state.colors:
+        shown = [own.seen_by(image, one.target.background, one.frame) for one, image in zip(batch, shown, strict=True)]
     return shown
 
 
 def compare(state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]) -> dict[str, Float[Tensor, ""]]:
     """The losses that compare pictures, by name: means over the frames."""
-    weights = state.avatar.config.photometric
-    for part in state.parts:
-        weights = part.weights(weights)
-    weights = weights.scaled(1 / len(batch))
+    own = state.avatar.config.photometric
+    weights = (own if state.head is None else state.head.weights(own)).scaled(1 / len(batch))
     return _summed(picture_losses(image, one.target, weights) for one, image in zip(batch, shown, strict=True))
 
 

@@ -1,24 +1,22 @@
 """The training loop, for every method."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from collections.abc import Sequence as Items
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien import _native
 from mien.avatar.avatar import Avatar, Posed, move_avatar
+from mien.avatar.baking import measure_filmed
 from mien.avatar.files import load_avatar
-from mien.avatar.filmed import measure_filmed
 from mien.avatar.methods import method_named, method_of
-from mien.avatar.schedules import Progress
-from mien.avatar.settings import FaceTuning, MethodConfig
+from mien.avatar.settings import FaceTuning, MethodConfig, Progress
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -32,7 +30,6 @@ from mien.perceptual.features import load_training_features
 from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
 from mien.training.adam import Adam
-from mien.training.ahead import targets_ahead
 from mien.training.batch import (
     TrainingData,
     coarse_steps,
@@ -42,27 +39,29 @@ from mien.training.batch import (
     face_groups,
     next_batch,
     seen,
+    targets_ahead,
 )
-from mien.training.camera_colors import camera_colors
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
+from mien.training.colors import camera_colors, frame_gains
 from mien.training.density_control import density_strategy
-from mien.training.face_track import FaceTrack, turns_from_mean
 from mien.training.footage.coverage import measure_coverage, representative_frames
+from mien.training.footage.face_track import FaceTrack, turns_from_mean
 from mien.training.footage.frames import (
+    DENSITY,
+    BatchFrame,
+    Footage,
     FrameOrder,
     camera_extent,
-    density_random,
     expression_rarity,
-    resolved,
+    random_at,
     training_frames,
 )
 from mien.training.footage.mesh_colors import vertex_colors
 from mien.training.footage.sequence import Sequence, Targets
-from mien.training.joining import prepare_parts
 from mien.training.losses import train_psnr
-from mien.training.parts import Preparation, Step, passed
 from mien.training.run import BUSY_REMEDY, claim_run, is_finished, write_results
-from mien.training.settings import TrainSettings
+from mien.training.settings import TrainSettings, resolved
+from mien.training.whole_head.head import WholeHead, prepare_whole_head
 from mien.training.whole_head.outline_fit import fitted_faces
 
 ALIGNED_TUNING = 0.2  # share of the learning rates of faces in a training on aligned faces. Measured: the log, 11-27
@@ -92,13 +91,7 @@ def train(
 
     If `run_dir` holds a stopped run with the same settings, training continues where it stopped, and the result has the
     same bytes as without the stop. If that run is finished, its avatar is loaded.
-
-    Raises:
-        UserError: a setting is out of range, or training diverges; trained features are not installed; `run_dir` holds
-            another run, or another process writes it; the face model differs from that of the tracking; the sequences
-            were not tracked together; or no frame is left to train on.
-        KeyboardInterrupt: after Ctrl-C, once a checkpoint is written.
-        Terminated: after SIGTERM, once a checkpoint is written.
+    Ctrl-C and SIGTERM (`Terminated`) are raised once a checkpoint is written.
     """
     method_config.check()
     settings.check()
@@ -118,11 +111,10 @@ def train(
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
         state = start(sequences, face_model, method_config, settings, like)
-        inside = next((part.hideable for part in state.parts if part.hideable is not None), None)
+        head = state.head
+        inside = None if head is None else head.hideable
         parts_of = face_model if method_config.photometric.needs_parts or inside is not None else None
-        for part in state.parts:
-            settings = part.settings(settings)
-        settings = resolved(settings, filled=False)
+        settings = resolved(settings, filled=head is not None and head.fills)
         cleaned = settings.edges == "cleaned"
         targets = tuple(
             Targets(sequence, settings.resolution, len(sequences), like, parts_of, inside, cleaned=cleaned)
@@ -131,11 +123,12 @@ def train(
         coarse = coarse_steps(targets, settings)
         halved = tuple(one.halved() for one in targets) if coarse else ()
         faces = [sequence.tracking.face for sequence in sequences]
-        looked = _REPRESENTATIVE_FRAMES
-        representative = representative_frames(faces, sequences, frames, looked, looked)
+        footage = Footage(face_model, sequences, faces, frames)
+        representative = representative_frames(footage, _REPRESENTATIVE_FRAMES, _REPRESENTATIVE_FRAMES)
         data = TrainingData(order, targets, extent, tuple(representative), halved, coarse)
         _train_to_the_end(state, data, settings, run_dir, progress, watch)
-        write_results(run_dir, state, state.covered or measure_coverage(face_model, sequences, faces, frames))
+        known = None if head is None else head.coverage
+        write_results(run_dir, state, known or measure_coverage(footage))
     return state.avatar
 
 
@@ -148,10 +141,9 @@ def _train_to_the_end(
     watch: Watch | None,
 ) -> None:
     """Continue from the newest checkpoint, if there is one, and take all steps that are left."""
-    resume(run_dir / "checkpoints", state, min(settings.record_every, settings.steps))
+    resume(run_dir / "checkpoints", state)
     with (
         one_torch_thread(),
-        _native_threads(settings.threads),
         stops_put_off() as stop,
         targets_ahead(data.order, data.targets_at, settings) as ahead,
     ):
@@ -170,7 +162,8 @@ def _train_to_the_end(
                         halved.forget()
                 if watch is not None:
                     watch(state.avatar)
-                if passed(before, state.step, settings.checkpoint_every) or stop.asked():
+                every = settings.checkpoint_every
+                if state.step // every > before // every or stop.asked():
                     _check_finite(run_dir, state)
                     write_checkpoint(run_dir / "checkpoints", state)
                 stop.follow()
@@ -198,7 +191,6 @@ def pretrain(
 
 
 def _check_finite(run_dir: Path, state: TrainingState) -> None:
-    """Check that training has not diverged, before anything is written."""
     for name, tensor in state.avatar.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             raise _diverged(run_dir, state, f"{name} is not finite")
@@ -243,32 +235,29 @@ def start(
     # Nothing of a held-out frame may reach the avatar, not even how its face was tracked.
     shown = sorted(set(used))
     avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
-    fitted = fitted_faces(face_model, sequences, frames, settings, bound=avatar.surface() is not None)
+    footage = Footage(face_model, sequences, faces, frames)
+    fitted = fitted_faces(footage, settings, bound=avatar.surface() is not None)
     if fitted is not None:
-        faces = fitted
+        faces, footage = fitted, replace(footage, faces=fitted)
         avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     face = concatenate(faces)
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
     avatar.filmed = measure_filmed(face[used], avatar.subject, eyes)
     surface = avatar.surface()
     if surface is not None and surface.wants_first_colors:
-        surface.set_first_colors(vertex_colors(face_model, sequences, faces, frames))
-    given = Preparation(
-        avatar, face_model, sequences, faces, frames, settings, torch.zeros(()) if like is None else like
-    )
-    make_parts = prepare_parts(given)
+        surface.set_first_colors(vertex_colors(footage))
+    like = torch.zeros(()) if like is None else like
+    gains, colors = (make(sequences, frames, settings, like) for make in (frame_gains, camera_colors))
+    make_head = prepare_whole_head(avatar, footage, settings)
     away = turns_from_mean(face, shown)
-    if like is not None:
-        move_avatar(avatar, like)
-        face = face.to(like)
-    parts, density = make_parts(), avatar.density()
-    for part in parts:
-        density = part.density(density)
-    strategy = density_strategy(density, avatar.gaussian_store())
+    move_avatar(avatar, like)
+    face = face.to(like)
+    head, density = None if make_head is None else make_head(like), avatar.density()
+    strategy = density_strategy(density if head is None else head.density(density), avatar.gaussian_store())
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     tuning = tuning_for(method_config.face_tuning, sequences)
     track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away, shown)
-    return TrainingState(avatar, Adam(), strategy, track, {}, parts, covered=given.known_coverage)
+    return TrainingState(avatar, Adam(), strategy, track, {}, head, gains, colors)
 
 
 def _first_avatar(config: MethodConfig, face_model: FaceModel, face: FaceParams, settings: TrainSettings) -> Avatar:
@@ -298,57 +287,79 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     many.
     """
     began = time.perf_counter()
-    avatar, parts = state.avatar, state.parts
+    avatar, head = state.avatar, state.head
     batch = next_batch(state, data, settings)
     progress = Progress(state.step, settings.steps, data.order.at(state.step)[1], data.extent, len(batch))
-    now = Step(
-        avatar, state.track, state.density, settings, tuple(batch), progress,
-        data.camera, data.representative, data.meanwhile,
-    )  # fmt: skip
-    for part in parts:
-        part.before_step(now)
+    if head is not None:
+        head.before_step(batch, data.meanwhile)
     whole, posed, renderings = draw(state, batch, progress)
     shown = seen(state, batch, renderings)
     losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
     losses |= compare_features(state, batch, shown)
-    for part in parts:
-        losses |= part.losses(now)
+    if head is not None:
+        losses |= head.losses(progress)
     torch.autograd.backward(list(losses.values()))
-    for part in parts:
-        part.after_backward(now, renderings)
+    if head is not None:
+        head.after_backward(progress, renderings)
 
-    changed = _update(state, now, posed, renderings)
-    for part in parts:
-        part.after_update(now)
-    state.step = now.done
-    for part in parts:
-        part.after_step(replace(now, changed=changed))
+    changed = _update(state, settings, batch, progress, posed, renderings)
+    state.step = progress.done
+    if head is not None:
+        _after_update(state, head, data, progress, changed=changed)
     elapsed = time.perf_counter() - began
     state.seconds += elapsed
-    if not now.reaches(settings.record_every) and state.step != settings.steps:
+    if not progress.reaches(settings.record_every) and state.step != settings.steps:
         return ""
     return _record(state, losses, train_psnr(shown[0], batch[0].target), elapsed * 1000 / len(batch))
 
 
-def _update(state: TrainingState, now: Step, posed: Items[Posed], renderings: Items[Rendering]) -> bool:
+def _update(
+    state: TrainingState,
+    settings: TrainSettings,
+    batch: Items[BatchFrame],
+    progress: Progress,
+    posed: Items[Posed],
+    renderings: Items[Rendering],
+) -> bool:
     """Update all trained tensors, then add and prune Gaussians. Returns whether the Gaussians may have changed."""
-    groups = [*state.avatar.parameter_groups(), *face_groups(state, now.batch)]
-    groups += [group for part in state.parts for group in part.parameter_groups()]
-    for own, rendering in zip(posed, renderings, strict=True):
-        state.density.observe(own, rendering)
-    state.adam.step(groups, now.progress)
-    for one in now.batch:
+    groups = [*state.avatar.parameter_groups(), *face_groups(state, batch)]
+    groups += [group for own in state.colors for group in own.learned.parameter_groups()]
+    if state.density is not None:
+        for own, rendering in zip(posed, renderings, strict=True):
+            state.density.observe(own, rendering)
+    state.adam.step(groups, progress)
+    for one in batch:
         state.track.confine(one.index)
-    if now.reaches(STEADY_EVERY):
+    if progress.reaches(STEADY_EVERY):
         state.track.steady_pose()
-    random = partial(density_random, now.settings, state.step)
-    return state.density.adapt(state.avatar.gaussian_store(), posed[0], now.progress, random)
+    if state.density is None:
+        return False
+    random = partial(random_at, settings.seed, DENSITY, progress.step)
+    return state.density.adapt(state.avatar.gaussian_store(), posed[0], progress, random)
+
+
+def _after_update(
+    state: TrainingState, head: WholeHead, data: TrainingData, progress: Progress, *, changed: bool
+) -> None:
+    """Keep a head to its surface. After a round and at the end, remove Gaussians that pictures do not show."""
+    head.after_update()
+    head.move_hair(progress)
+    last = progress.done >= progress.steps
+    if state.density is not None and head.fills and (changed or last) and data.representative:
+        track = state.track
+
+        def redundant() -> Bool[Tensor, " n"]:
+            views = [
+                (track.face(track.index_of(*frame[:2])).detach(), data.camera(frame)) for frame in data.representative
+            ]
+            return head.redundant(views, last=last)
+
+        state.density.thin(state.avatar.gaussian_store(), redundant)
 
 
 def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: float, step_ms: float) -> str:
-    """Add an entry to the curves, and return a text for the progress bar."""
     entry = {name: float(value.detach()) for name, value in losses.items()}
-    rare = [name for part in state.parts for name in part.rare_losses]
+    rare = [] if state.head is None else [*state.head.rare_losses]
     rare += ["perceptual"] if state.avatar.config.photometric.perceptual.weight > 0 else []
     for name in rare:
         entry.setdefault(name, 0.0)
@@ -357,16 +368,3 @@ def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: fl
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"
-
-
-@contextmanager
-def _native_threads(count: int) -> Iterator[None]:
-    """Let native operations use `count` threads; 0 changes nothing."""
-    before = _native.thread_count()
-    if count > 0:
-        _native.set_thread_count(count)
-    try:
-        yield
-    finally:
-        if count > 0:
-            _native.set_thread_count(before)

@@ -13,21 +13,31 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
 from mien.avatar.baking import as_array, bake_rig
-from mien.avatar.density import GradientDensity, highest_opacities_seen
-from mien.avatar.gaussian_avatars.changes import BASES, change_penalties
-from mien.avatar.gaussian_avatars.feature_appearance import FeatureAppearance, feature_tensors
+from mien.avatar.bound_surface import BoundSurface
+from mien.avatar.density import GradientDensity
+from mien.avatar.gaussian_avatars.changes import BASES, FeatureAppearance, change_penalties, feature_tensors
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
-from mien.avatar.gaussian_avatars.surface import GaussianSurface
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
 from mien.avatar.ops.expression_changes import ExpressionActivations, expression_change
 from mien.avatar.ops.triangle_penalties import triangle_penalties
-from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
+from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import stack_timesteps
 from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
+
+_RATES = {
+    "log_scales": Rate(0.017),
+    "quats": Rate(1e-3),
+    "opacity_logits": Rate(0.05),
+    "sh_constant": Rate(2.5e-3),
+}
+"""Learning rates of the paper (its supplement, section B)."""
+_HIGHER_DEGREES_RATE = Rate(2.5e-3 / 20)  # of coefficients of higher degrees: a twentieth, as in the published code
+_BASIS_RATES = {"color_basis": Rate(1e-3), "opacity_basis": Rate(0.01), "offset_basis": Rate(1e-3, 1e-5)}
+"""Learning rates of linear changes with the expression, per unit of an activation."""
 
 
 class GaussianAvatars(Avatar):
@@ -36,7 +46,14 @@ class GaussianAvatars(Avatar):
     config: GaussianAvatarsConfig
 
     def __init__(self, config: GaussianAvatarsConfig, face_model: FaceModel, face: FaceParams):
-        super().__init__(config, face_model, face, Extras(surface=GaussianSurface(self, config)))
+        surface = BoundSurface(
+            lambda: self.store,
+            lambda: (self.face_model.head_vertices(self.subject)[0], self.face_model.faces),
+            limited=config.surface_limits,
+            first_colors=config.first_colors == "pictures",
+            penalties=lambda changes: change_penalties(config, changes),
+        )
+        super().__init__(config, face_model, face, Extras(surface=surface))
         like, n = face_model.template, face_model.faces.shape[0]
         trained = {
             "means": like.new_zeros(n, 3),
@@ -52,8 +69,7 @@ class GaussianAvatars(Avatar):
         self.appearance = None
         if config.appearance == "features":
             trained |= feature_tensors(trained["means"], self._activation_count, config.appearance_features)
-            widths = (config.appearance_features, config.appearance_hidden)
-            self.appearance = FeatureAppearance(like[:, 0], *widths)
+            self.appearance = FeatureAppearance(like[:, 0], config.appearance_features)
         if self._changes:
             self.activations = ExpressionActivations(face, self.subject, self._activation_count)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
@@ -91,13 +107,12 @@ class GaussianAvatars(Avatar):
 
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shapes of a Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
-        rank, rates = self.config.expression_rank, self._basis_rates()
-        wanted = [name for name in BASES if rank > 0 and rates[name].start > 0]
+        rank, kinds = self.config.expression_rank, self.config.expression_changes
+        wanted = [name for name in BASES if rank > 0 and name.removesuffix("_basis") in kinds]
         return {name: (rank,) if name == "opacity_basis" else (3, rank) for name in wanted}
 
     @property
     def _changes(self) -> bool:
-        """Whether Gaussians change with the expression beside the mesh."""
         return bool(self._basis_shapes()) or self.config.appearance == "features"
 
     @property
@@ -109,11 +124,6 @@ class GaussianAvatars(Avatar):
     def _opacity_changes(self) -> bool:
         return "opacity_basis" in self._basis_shapes() or self.config.appearance == "features"
 
-    def _basis_rates(self) -> dict[str, Rate]:
-        config = self.config
-        rates = (config.expression_color_rate, config.expression_opacity_rate, config.expression_offset_rate)
-        return dict(zip(BASES, rates, strict=True))
-
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Section 3.4: how far visible Gaussians exceed the thresholds of distance and scale, in triangle units.
 
@@ -124,48 +134,38 @@ class GaussianAvatars(Avatar):
             self.store["means"],
             self.store["log_scales"],
             rendering.radii if rendering.radii.ndim == 1 else rendering.radii.amax(0),
-            thresholds=(config.position_threshold, config.scale_threshold),
-            weights=(config.position_weight, config.scale_weight),
+            thresholds=(1.0, config.scale_threshold),
+            weights=(config.position_weight, 1.0),
         )
         return {"position": position, "scale": scale, **change_penalties(config, posed.aux)}
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group per tensor."""
-        config, rates = self.config, {}
-        rates["means"], rates["log_scales"], rates["quats"] = (
-            config.means_rate,
-            config.log_scales_rate,
-            config.quats_rate,
-        )
-        rates["opacity_logits"], rates["sh_constant"] = config.opacity_rate, config.color_rate
+        config = self.config
+        rates = {"means": config.means_rate, **_RATES}
         if config.sh_degree > 0:
-            rates["sh_rest"] = Rate(config.color_rate.start / 20)
-        rates |= {name: self._basis_rates()[name] for name in self._basis_shapes()}
+            rates["sh_rest"] = _HIGHER_DEGREES_RATE
+        rates |= {name: _BASIS_RATES[name] for name in self._basis_shapes()}
         extent = {"means": config.means_times_extent}
         groups = [
             store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
         ]
         if self.appearance is not None:
-            own = (config.appearance_rate, config.appearance_network_rate)
-            groups += self.appearance.parameter_groups(self.store, *own)
+            groups += self.appearance.parameter_groups(self.store)
         return groups
-
-    def gaussian_store(self) -> GaussianStore:
-        """Every per-Gaussian tensor."""
-        return self.store
 
     def density(self) -> GradientDensity:
         """Gradient-based control. Children stay on their parent's triangle; no triangle loses its last Gaussian."""
         return GradientDensity(
             self.config.density,
             opacity_logits="opacity_logits",
-            judged_opacities=highest_opacities_seen if self._opacity_changes else resting_opacities,
+            judged_opacities=None if self._opacity_changes else resting_opacities,
             may_prune=never_empty_a_triangle,
         )
 
     def bake(self) -> MeshBound:
         """The mesh of this subject and the raw values of all Gaussians."""
-        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        store = self.store.arrays()
         sh = as_array(self._active_sh(TRAINED))
         return MeshBound(
             rig=bake_rig(self.face_model, self.subject),
@@ -178,7 +178,6 @@ class GaussianAvatars(Avatar):
         )
 
     def _bake_changes(self) -> ExpressionChanges | None:
-        """The changes with the expression, or None if the settings ask for none."""
         if not self._changes:
             return None
         features = None if self.appearance is None else self.appearance.bake(self.store)
@@ -199,7 +198,6 @@ class GaussianAvatars(Avatar):
         return "head" if self.config.sh_degree == 0 else self.config.sh_frame
 
     def _active_sh(self, progress: Progress) -> Float[Tensor, "n k 3"]:
-        """SH coefficients up to the degree that is active."""
         degree = self.config.sh_degree
         if degree == 0:
             return self.store["sh_constant"]

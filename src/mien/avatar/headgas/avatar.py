@@ -4,7 +4,7 @@ No code was published, so this is written from the paper, its supplement and its
 of latent features by the expression. One small network turns the result into colour and opacity, so that lips fade
 where teeth appear. The paper leaves some choices open, which were made here: joints that no expression drives are
 appended to the expression vector, because nothing else would move the gaze; the learning rates; the bands and the
-length unit of the encoding; and the opacity to prune by. `headgas_variants` has the paper's ablations.
+length unit of the encoding; and the opacity to prune by. The paper's ablations are in `variants.py`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,44 +26,33 @@ from mien.avatar.avatar import (
     network_group,
     store_group,
 )
-from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
-from mien.avatar.baking import as_array
+from mien.avatar.baking import Kept, as_array, can_pose_baked, pose_baked
 from mien.avatar.density import GradientDensity
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.variants import (
-    VARIANTS,
+    ABLATIONS,
     Changes,
-    Parts,
-    averaging_weights,
+    colors_of,
+    encoded,
+    feature_tensors,
+    moved_by,
     new_network,
-    output_widths,
-    split_outputs,
-    start_logit,
 )
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.expression_changes import expression_inputs, principal_directions
-from mien.avatar.ops.feature_network import (
-    Layers,
-    blended_features,
-    feature_network,
-)
-from mien.avatar.schedules import TRAINED, Progress, Rate, active_degree
+from mien.avatar.ops.feature_network import Layers, feature_network
+from mien.avatar.ops.points import positional_encoding, sample_surface
+from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
-from mien.avatar.surface_places import sample_surface
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
 from mien.render.rendering import Rendering
-from mien.rotation import multiply_quaternions
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
 
-_COLOR_RATE = 2.5e-3
-"""Learning rate of colours against which that of opacities in the same tensor is measured. Of 3D Gaussian Splatting."""
-SHIFT_LENGTH = 0.01  # unit of the network's shifts, in metres. The papers do not say one
-_OPACITY_RATE = 0.05  # learning rate of opacities that Gaussians have themselves. Of 3D Gaussian Splatting
+_OPACITY_RATE = Rate(0.05)  # of opacities that Gaussians have themselves. Of 3D Gaussian Splatting
 
 _CHUNK = 512
 
@@ -77,40 +66,35 @@ class HeadGas(Avatar):
     judged: Tensor
 
     def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
-        n, parts = config.points, VARIANTS[config.variant]
-        # Two of the ablations move Gaussians, and one averages, which no record of `mien.runtime` can say.
-        unbaked = parts.unbaked and f"the variant {config.variant} of headgas: {parts.unbaked}"
+        n, ablation = config.points, ABLATIONS.get(config.variant)
+        unbaked = ablation and ablation.unbaked and f"the variant {config.variant} of headgas: {ablation.unbaked}"
         super().__init__(config, face_model, face, Extras(unbaked=unbaked))
         means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
         rest, directions = input_directions(face, self.subject, config.directions)
         self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
-        # Without a network, the features are the outputs themselves.
-        width = config.features if parts.layers else sum(output_widths(parts, 3 * self._coefficients))
-        trained = {
+        spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
+        # Not in files: only training needs it, and makes it anew.
+        self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
+        shapes = {
             "means": means,
             "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "log_scales": neighbor_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
         }
-        if parts.blends:
-            # The bases start at zero, as in the paper.
-            trained["bases"] = means.new_zeros(n, directions.shape[1], width)
-            trained["neutral_features"] = means.new_zeros(n, width)
-        if not parts.recolors:
-            trained["sh"] = means.new_zeros(n, self._coefficients, 3)
-            trained["opacity_logits"] = start_logit().to(means).repeat(n)
-        spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
-        # Not in files: only training needs it, and makes it anew.
-        self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
-        self.store = GaussianStore(trained)
-        self._bases_gradient, self._baked = FactoredGradient(), Kept[Static]()
-        inputs = (width if parts.blends else directions.shape[1]) + 3 + 6 * config.encoding_bands
-        self.network = new_network(parts, inputs, config.hidden, 3 * self._coefficients).to(means)
+        k = directions.shape[1]
+        if ablation is None:
+            features = feature_tensors(means, k, config.features)
+            sizes = [config.features + encoded(config), config.hidden, colors_of(config) + 1]
+            network = new_network(sizes)
+        else:
+            features, network = ablation.tensors(means, k, config), ablation.network(k, config)
+        self.store, self.network = GaussianStore(shapes | features), network.to(means)
+        self.bases_gradient, self._baked, self._ablation = FactoredGradient(), Kept[Static](), ablation
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep. Colours and opacities differ between them.
 
-        Two variants also move Gaussians (supplement, eq. 1 to 3). An avatar that is not in training mode (`eval()`)
-        poses its baked form, if there is one, unless `face` is to have gradients.
+        An avatar that is not in training mode (`eval()`) poses its baked form, if there is one, unless `face` is to
+        have gradients.
         """
         store = self.store
         if (
@@ -123,21 +107,15 @@ class HeadGas(Avatar):
             return Posed(pose_baked(baked, face), {})
         inputs = (expression_inputs(face) - self.rest) @ self.directions
         changes = list(self._changes(inputs, progress))
-        sh = _stacked([one.colors for one in changes]).unflatten(-1, (self._coefficients, 3))
+        sh = _stacked([one.colors for one in changes]).unflatten(-1, (-1, 3))
         opacities = sigmoid(_stacked([one.opacity_logits for one in changes]))
-        means, quats, aux = store["means"], store["quats"], {}
+        scales = store["log_scales"].exp()
+        gaussians = Gaussians(store["means"], store["quats"], scales, opacities, sh, head_poses(face))
         moved = [one.moved for one in changes if one.moved is not None]
-        if moved:
-            shifts, turns = _stacked(moved).split([3, 4], dim=-1)
-            aux["shifts"] = SHIFT_LENGTH * shifts
-            means = means + aux["shifts"]
-            identity = turns.new_tensor([1.0, 0.0, 0.0, 0.0])
-            quats = multiply_quaternions(identity + turns, quats.expand_as(turns))
-        gaussians = Gaussians(means, quats, store["log_scales"].exp(), opacities, sh, head_poses(face))
-        return Posed(gaussians, aux)
+        return moved_by(gaussians, _stacked(moved)) if moved else Posed(gaussians, {})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """The size of the shifts, for variants that move Gaussians (supplement, eq. 4)."""
+        """None, but for the size of the shifts in ablations that move Gaussians (supplement, eq. 4)."""
         if "shifts" not in posed.aux:
             return {}
         return {"shift": self.config.shift_weight * posed.aux["shifts"].abs().mean()}
@@ -145,25 +123,25 @@ class HeadGas(Avatar):
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group per tensor, and one for the network."""
         config = self.config
-        rates = {"means": config.means_rate, "log_scales": config.log_scales_rate, "quats": config.quats_rate}
-        parts = self._parts
-        if parts.blends:
-            rates["neutral_features"] = config.features_rate
-        if not parts.recolors:
-            rates |= {"sh": config.features_rate, "opacity_logits": Rate(_OPACITY_RATE)}
+        rates = {
+            "means": config.means_rate,
+            "log_scales": config.log_scales_rate,
+            "quats": config.quats_rate,
+            "neutral_features": config.features_rate,
+            "sh": config.features_rate,
+            "opacity_logits": _OPACITY_RATE,
+        }
         extent = {"means": config.means_times_extent}
         groups = [
-            store_group(self.store, name, rate, times_extent=extent.get(name, False)) for name, rate in rates.items()
+            store_group(self.store, name, rates[name], times_extent=extent.get(name, False))
+            for name in self.store.names()
+            if name in rates
         ]
-        if parts.blends:
+        if "bases" in self.store.names():
             kind = FactoredMoments if config.factored_bases else Moments
-            groups.append(factored_group(self.store, "bases", config.features_rate, self._bases_gradient, kind))
+            groups.append(factored_group(self.store, "bases", config.features_rate, self.bases_gradient, kind))
         network = network_group("network", self.network, config.network_rate)
-        return [*groups, replace(network, epsilon=config.network_epsilon)] if parts.layers else groups
-
-    def gaussian_store(self) -> GaussianStore:
-        """Every per-Gaussian tensor."""
-        return self.store
+        return [*groups, replace(network, epsilon=config.network_epsilon)]
 
     def density(self) -> GradientDensity:
         """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
@@ -185,111 +163,67 @@ class HeadGas(Avatar):
         """Static points, with the bases of the features and the network."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
-        store = {name: as_array(self.store[name]) for name in self.store.names()}
+        store = self.store.arrays()
         n = len(self.store)
         neutral, along = self._baked_features()
         layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
-        shares = self._output_shares().to(layers[-1].weight)
+        shares = self.output_shares(TRAINED).to(layers[-1].weight)
         weights = [*(layer.weight for layer in layers[:-1]), layers[-1].weight * shares[:, None]]
         biases = [*(layer.bias for layer in layers[:-1]), layers[-1].bias * shares]
         network = AttributeNetwork(
             input="features",
-            base=np.concatenate([as_array(neutral), as_array(self._encoding())], axis=1),
+            base=np.concatenate([as_array(neutral), as_array(self.encoding())], axis=1),
             weights=tuple(map(as_array, weights)),
             biases=tuple(map(as_array, biases)),
             activation="leaky_relu",
             outputs=("sh", "opacity_logits"),
             along=along,
         )
-        none, no_sh = np.zeros(n, np.float32), np.zeros((n, self._coefficients, 3), np.float32)
+        none, no_sh = np.zeros(n, np.float32), np.zeros((n, colors_of(self.config) // 3, 3), np.float32)
         attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
         names, free = self.face_model.expression_names, self.face_model.free_joint_names
         return Static(store["means"], attributes, names, free, network=network)
 
     def _baked_features(self) -> tuple[Float[Tensor, "n w"], FeatureDirections]:
-        """A network's first columns for the person at rest, and what the face adds to them."""
         rest, directions = as_array(self.rest), as_array(self.directions)
-        if self._parts.blends:
+        if "bases" in self.store.names():
             return self.store["neutral_features"], FeatureDirections(rest, directions, as_array(self.store["bases"]))
         # Without features, the columns are the inputs along the directions, the same for all Gaussians.
         n, k = len(self.store), directions.shape[1]
         same = np.broadcast_to(np.eye(k, dtype=np.float32), (n, k, k))
         return self.rest.new_zeros(n, k), FeatureDirections(rest, directions, same.copy())
 
-    @property
-    def _parts(self) -> Parts:
-        return VARIANTS[self.config.variant]
-
-    @property
-    def _coefficients(self) -> int:
-        return (self.config.sh_degree + 1) ** 2
-
-    @property
-    def _last_layer(self) -> nn.Linear:
-        last = self.network[-1]
-        assert isinstance(last, nn.Linear)
-        return last
-
     def _changes(self, inputs: Float[Tensor, "b k"], progress: Progress = TRAINED) -> Iterator[Changes]:
-        """What the variant gives at each of some timesteps, whose inputs are along the directions."""
-        store, parts = self.store, self._parts
-        if parts.layers == 0:
-            shares = self._output_shares(progress).to(inputs)
-            for e in inputs:
-                weights, rest = averaging_weights(e)
-                neutral = rest * store["neutral_features"]
-                values = shares * self._blended(weights, neutral)
-                yield Changes(values[:, :-1], values[:, -1] + start_logit().to(values))
+        """Colours and opacities at each of some timesteps, whose inputs are along the directions."""
+        if self._ablation is not None:
+            yield from self._ablation.changes(self, inputs, progress)
             return
-        encoding = self._encoding()
-        if not parts.blends:
-            shares = self._output_shares(progress).to(inputs)
-            for e in inputs:
-                values = shares * self.network(torch.cat([e.expand(len(encoding), -1), encoding], dim=-1))
-                yield Changes(values[:, :-1], values[:, -1])
-            return
-        layers = self._layers(progress)
+        first, _, last = self.network
+        assert isinstance(first, nn.Linear)
+        assert isinstance(last, nn.Linear)
+        shares = self.output_shares(progress).to(last.weight)
+        layers = Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
+        encoding = self.encoding()
         for e in inputs:
-            found = split_outputs(parts, *self._outputs(e, encoding, layers))
-            yield found if isinstance(found, Changes) else self._unpainted(found, progress)
+            yield Changes(*self.outputs(e, encoding, layers))
 
-    def _blended(self, weights: Float[Tensor, " k"], neutral: Float[Tensor, "n f"]) -> Float[Tensor, "n f"]:
-        return blended_features(self.store["bases"], weights, neutral, self._bases_gradient)
-
-    def _outputs(
+    def outputs(
         self, inputs: Float[Tensor, " k"], encoding: Float[Tensor, "n c"], layers: Layers
     ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
-        """The network's outputs at one timestep."""
+        """The outputs of a network at one timestep: all but the last, and the last."""
         bases, neutral = self.store["bases"], self.store["neutral_features"]
-        return feature_network(bases, inputs, neutral, encoding, layers, self._bases_gradient)
+        return feature_network(bases, inputs, neutral, encoding, layers, self.bases_gradient)
 
-    def _unpainted(self, moved: Float[Tensor, "n 7"], progress: Progress) -> Changes:
-        shares = self._color_shares(progress).to(moved)
-        return Changes((shares * self.store["sh"]).flatten(1), self.store["opacity_logits"], moved)
-
-    def _layers(self, progress: Progress = TRAINED) -> Layers:
-        first, last = self.network[0], self._last_layer
-        assert isinstance(first, nn.Linear)
-        shares = self._output_shares(progress).to(last.weight)
-        return Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
-
-    def _output_shares(self, progress: Progress = TRAINED) -> Float[Tensor, " o"]:
-        """Factors of the outputs, which are 1 but for colours; without a network, opacities have one of their own."""
-        colors, moved, opacity = output_widths(self._parts, 3 * self._coefficients)
-        shares = self._color_shares(progress).flatten()[:colors]
-        # Explicit colours and opacities are in one tensor, but opacities learn at their own rate.
-        faster = 1.0 if self._parts.layers else _OPACITY_RATE / _COLOR_RATE
-        return torch.cat([shares, torch.ones(moved), torch.full((opacity,), faster)])
-
-    def _color_shares(self, progress: Progress) -> Float[Tensor, "s 3"]:
-        """Factors of the colours' coefficients: of higher degrees, a share, and 0 before they begin."""
+    def output_shares(self, progress: Progress) -> Float[Tensor, " o"]:
+        """Factors of colours and opacity. Of higher degrees of colours, a share, and 0 before they begin."""
         config = self.config
-        shares = torch.ones(self._coefficients, 3)
+        shares = torch.ones(colors_of(config) // 3, 3)
         shares[1:] = config.sh_higher_share
         shares[(active_degree(config.sh_degree, config.sh_warmup, progress) + 1) ** 2 :] = 0
-        return shares
+        return torch.cat([shares.flatten(), torch.ones(1)])
 
-    def _encoding(self) -> Float[Tensor, "n c"]:
+    def encoding(self) -> Float[Tensor, "n c"]:
+        """The positional encoding of the centres."""
         # Detached by default, so that centres move only by their effect on the picture.
         means = self.store["means"]
         points = (means if self.config.encoding_gradient else means.detach()) / self.config.encoding_length

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import EPSILON_RANGE, Differences, FaceTuning, GradientSettings, MethodConfig
+from mien.avatar.settings import EPSILON_RANGE, Differences, FaceTuning, GradientSettings, MethodConfig, Rate
 from mien.disk.config import FRACTION, NOT_NEGATIVE, Range, ToLoad
 
 Variant = Literal["full", "no_mlp", "delta", "change_all", "no_blending"]
@@ -16,22 +15,18 @@ class HeadGasConfig(MethodConfig):
     """Settings of HeadGaS. The defaults suit a CPU and runs of some thousand steps."""
 
     variant: Variant = "full"
-    """The method itself (`full`), or one of the paper's ablations. `no_mlp` averages explicit colours and opacities,
-    without a network. `delta` moves and turns Gaussians instead of painting them. `change_all` does both.
-    `no_blending` has no features: a network of five layers takes the expression and the place."""
+    """The method itself (`full`), or an ablation: without a network (`no_mlp`), with one that moves and turns Gaussians
+    (`delta`), paints and moves them (`change_all`), or takes the expression itself (`no_blending`)."""
     shift_weight: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Weight of the mean absolute shift of the centres, in metres, which only `delta` and `change_all` have. The paper
-    has this term, but not its weight."""
+    """Weight of the mean absolute shift in metres, for `delta` and `change_all`. The paper does not state it."""
     face_tuning: FaceTuning = FaceTuning(within_bounds=True)
-    """Whether and how fast training changes the tracked face parameters of each frame."""
     points: Annotated[int, Range(4, 1_000_000), ToLoad(4)] = 2500
     """Number of Gaussians at the start, sampled on the subject's mesh."""
     features: Annotated[int, Range(1, 1024)] = 32
-    """Number of latent features per Gaussian, as in the paper. More features need more memory and time per step."""
+    """Number of latent features per Gaussian, as in the paper."""
     directions: Annotated[int, Range(0, 1024)] = 20
     """Number of directions of the face along which features change: those of the largest spread over the training
-    timesteps. 0 means as many as the face has inputs (expression coefficients and angles of joints), as in the paper.
-    Fewer need less memory and time per step; a finished avatar follows all inputs either way."""
+    timesteps. 0: as many as the face has inputs, as in the paper. Fewer need less memory and time."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4
@@ -39,24 +34,20 @@ class HeadGasConfig(MethodConfig):
     encoding_length: Annotated[float, Range(1e-4, 1e4)] = 0.05
     """Length of one unit in the positional encoding, in metres."""
     encoding_gradient: bool = False
-    """Whether centres also move by what the encoding of their position changes in the network, as the paper's formulas
-    say. Otherwise they move only by their effect on the picture, which takes less time."""
+    """Whether centres also move by what their encoding changes in the network, as in the paper's formulas."""
     factored_bases: bool = True
-    """Whether the bases of features are trained without a first moment and with one second moment for all directions,
-    which takes much less memory and time. Otherwise by Adam, as all else."""
+    """Whether the bases are trained without a first moment and with one second moment for all directions, which takes
+    much less memory and time. Otherwise by Adam."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
-    """Degree of the spherical harmonics for view-dependent colour. Keep 0 with a single camera, because
-    view-dependent colours then absorb the head's pose."""
+    """Degree of the spherical harmonics. With a single camera, higher ones than 0 absorb the head's pose."""
     sh_warmup: Annotated[float, FRACTION] = 0.3
-    """Fraction of the run over which the degrees of the spherical harmonics are switched on, one after the other."""
+    """Fraction of the run over which the degrees are switched on, one after the other."""
     sh_higher_share: Annotated[float, FRACTION] = 0.05
-    """Factor of the coefficients of higher degrees. The network learns them at this share of the constant colour's
-    rate; 3D Gaussian Splatting uses a twentieth."""
+    """Factor of the coefficients of higher degrees, which the network learns at this share of the rate."""
     means_rate: Rate = Rate(1e-4, 1e-6)
     """Learning rate of the centres, in metres per step."""
     means_times_extent: bool = False
-    """Whether the learning rate of the centres is multiplied by the extent of the training cameras in metres, as in
-    3D Gaussian Splatting."""
+    """Whether this rate is multiplied by the extent of the cameras in metres, as in 3D Gaussian Splatting."""
     log_scales_rate: Rate = Rate(5e-3)
     """Learning rate of the logarithms of the scales, per step."""
     quats_rate: Rate = Rate(1e-3)
@@ -66,16 +57,14 @@ class HeadGasConfig(MethodConfig):
     network_rate: Rate = Rate(2e-3, 2e-4)
     """Learning rate of the network, per step."""
     network_epsilon: Annotated[float, EPSILON_RANGE] = 1e-15
-    """Adam's epsilon for the network. Networks are mostly trained with 1e-8; with another one than 1e-15, steps take a
-    little longer, because only that one is in the native code."""
+    """Adam's epsilon for the network. Only 1e-15 is in the native code."""
     judged_expressions: Annotated[int, Range(0, 10_000)] = 64
-    """Number of training expressions, as different as possible, at which each round of density control computes the
-    opacities to prune by. With 0, only the opacities in the steps since the last round count."""
+    """Number of training expressions, as different as possible, at which opacities to prune by are computed."""
     density: GradientSettings = GradientSettings(
         opacity_resets=(), size_start=0.1, prune_size=0.03, max_gaussians=20_000
     )
-    """Density control: when and where Gaussians are added and removed. Opacities come from the network and are never
-    reset, so `size_start` sets when large Gaussians are removed."""
+    """Density control. Opacities come from the network and are never reset, so `size_start` sets when large Gaussians
+    are removed."""
 
 
 _STEPS, _ROUND, _FIRST, _LAST, _DEGREE_STEPS, _PERCEPTUAL = 50_000, 100, 500, 15_000, 1_000, 10_000

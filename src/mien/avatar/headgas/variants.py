@@ -1,99 +1,91 @@
-"""The ablations of HeadGaS (supplement, section 2): what each variant is made of, and what it gives for an expression.
+"""The ablations of HeadGaS (supplement, section 2): what differs in each from the method itself.
 
 The ablation without the perceptual loss is no variant: it is the method with `photometric.perceptual.weight` 0.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.avatar.headgas.settings import Variant
-from mien.avatar.ops.feature_network import SLOPE
+from mien.avatar.avatar import Posed
+from mien.avatar.headgas.settings import HeadGasConfig, Variant
+from mien.avatar.ops.feature_network import SLOPE, Layers, blended_features
+from mien.avatar.settings import Progress
+from mien.gaussians import Gaussians
+from mien.rotation import multiply_quaternions
 
-_START_OPACITY = 0.1  # opacity of all Gaussians at the start. Of 3D Gaussian Splatting
-
+START_OPACITY = 0.1  # opacity of all Gaussians at the start. Of 3D Gaussian Splatting
+SHIFT_LENGTH = 0.01  # unit of the network's shifts, in metres. The papers do not say one
 MOVED = 7
 """Numbers that move a Gaussian: a shift (3), and a rotation as a quaternion less the identity (4)."""
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a variant is made of."""
-
-    layers: int
-    """Linear layers of the network. 0 means that there is none, and that the bases are colours and opacities."""
-    blends: bool
-    """Whether Gaussians have bases that the expression weights. If not, the network takes the expression itself."""
-    recolors: bool
-    """Whether colours and opacities depend on the expression. If not, each Gaussian has its own."""
-    moves: bool
-    """Whether positions and rotations depend on the expression."""
-    unbaked: str | None = None
-    """Why there is no record of `mien.runtime` for it."""
-
-
-_AVERAGE = "its average of colours is not linear in the expression"
-_MOVES = "its network moves Gaussians"
-VARIANTS: dict[Variant, Parts] = {
-    "full": Parts(2, blends=True, recolors=True, moves=False),
-    "no_mlp": Parts(0, blends=True, recolors=True, moves=False, unbaked=_AVERAGE),
-    "delta": Parts(2, blends=True, recolors=False, moves=True, unbaked=_MOVES),
-    "change_all": Parts(2, blends=True, recolors=True, moves=True, unbaked=_MOVES),
-    "no_blending": Parts(5, blends=False, recolors=True, moves=False),
-}
+_FASTER_OPACITY = 0.05 / 2.5e-3
+"""Learning rate of explicit opacities relative to that of colours, which are in the same tensor. Of 3D Gaussian
+Splatting."""
 
 
 class Changes(NamedTuple):
-    """What a variant gives for one timestep."""
+    """What depends on the expression, at one timestep."""
 
     colors: Float[Tensor, "n c"]
     """Spherical harmonics, all coefficients of all channels."""
     opacity_logits: Float[Tensor, " n"]
     moved: Float[Tensor, "n 7"] | None = None
-    """Columns as in `MOVED`, if the variant moves Gaussians."""
+    """Columns as in `MOVED`. Only ablations move Gaussians."""
 
 
-def output_widths(parts: Parts, colors: int) -> tuple[int, int, int]:
-    """Columns of a variant's outputs, in their order: colours, what moves Gaussians, opacity."""
-    return (colors if parts.recolors else 0), (MOVED if parts.moves else 0), (1 if parts.recolors else 0)
+@dataclass(frozen=True)
+class Ablation:
+    """What a variant does in the place of the method."""
+
+    tensors: Callable[[Float[Tensor, "n 3"], int, HeadGasConfig], dict[str, Tensor]]
+    """(centres, number of directions, settings) -> trained tensors beside the shapes of Gaussians."""
+    network: Callable[[int, HeadGasConfig], nn.Sequential]
+    """(number of directions, settings) -> the network."""
+    changes: Callable[[Any, Float[Tensor, "b k"], Progress], Iterator[Changes]]
+    """(avatar, inputs along the directions, progress) -> what depends on the expression at each timestep."""
+    unbaked: str | None = None
+    """Why there is no record of `mien.runtime` for it."""
 
 
-def new_network(parts: Parts, inputs: int, hidden: int, colors: int) -> nn.Sequential:
-    """A variant's network. At first it moves nothing, and paints faint Gaussians in about grey."""
-    if parts.layers == 0:
-        return nn.Sequential()
-    first, moved, opacity = output_widths(parts, colors)
-    sizes = [inputs, *[hidden] * (parts.layers - 1), first + moved + opacity]
+def colors_of(config: HeadGasConfig) -> int:
+    """Number of coefficients of all channels."""
+    return 3 * (config.sh_degree + 1) ** 2
+
+
+def encoded(config: HeadGasConfig) -> int:
+    """Number of columns of the positional encoding."""
+    return 3 + 6 * config.encoding_bands
+
+
+def feature_tensors(means: Float[Tensor, "n 3"], directions: int, width: int) -> dict[str, Tensor]:
+    """Bases and neutral features, which start at zero, as in the paper."""
+    n = len(means)
+    return {"bases": means.new_zeros(n, directions, width), "neutral_features": means.new_zeros(n, width)}
+
+
+def new_network(sizes: list[int], moved: slice | None = None, *, opacity: bool = True) -> nn.Sequential:
+    """Layers with leaky ReLU between them. At first they move nothing, and paint faint Gaussians in about grey."""
     layers = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.LeakyReLU(SLOPE))]
     network = nn.Sequential(*layers[:-1])
     last = network[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():
         last.bias.zero_()
-        last.weight[first : first + moved] = 0
-        if parts.recolors:
+        if moved is not None:
+            last.weight[moved] = 0
+        if opacity:
             last.bias[-1] = start_logit()
     return network
 
 
 def start_logit() -> Float[Tensor, ""]:
     """The logit of the opacity at the start."""
-    return torch.logit(torch.tensor(_START_OPACITY))
-
-
-def split_outputs(
-    parts: Parts, others: Float[Tensor, "n p"], last: Float[Tensor, " n"]
-) -> Changes | Float[Tensor, "n 7"]:
-    """All outputs of a network but the last, and the last, as changes; only what moves Gaussians if it paints none."""
-    if not parts.recolors:
-        return torch.cat([others, last[:, None]], dim=-1)
-    if not parts.moves:
-        return Changes(others, last)
-    return Changes(others[:, :-MOVED], last, others[:, -MOVED:])
+    return torch.logit(torch.tensor(START_OPACITY))
 
 
 def averaging_weights(inputs: Float[Tensor, " k"]) -> tuple[Float[Tensor, " k"], Float[Tensor, ""]]:
@@ -104,3 +96,86 @@ def averaging_weights(inputs: Float[Tensor, " k"]) -> tuple[Float[Tensor, " k"],
     """
     total = 1 + inputs.abs().sum()
     return inputs / total, 1 / total
+
+
+def moved_by(gaussians: Gaussians, moved: Float[Tensor, "b n 7"]) -> Posed:
+    """Gaussians moved and turned (supplement, eq. 1 to 3), with the shifts for their penalty."""
+    shifts, turns = moved.split([3, 4], dim=-1)
+    shifts = SHIFT_LENGTH * shifts
+    turned = multiply_quaternions(turns.new_tensor([1.0, 0.0, 0.0, 0.0]) + turns, gaussians.quats.expand_as(turns))
+    return Posed(replace(gaussians, means=gaussians.means + shifts, quats=turned), {"shifts": shifts})
+
+
+def _explicit(means: Tensor, directions: int, config: HeadGasConfig) -> dict[str, Tensor]:
+    return feature_tensors(means, directions, colors_of(config) + 1)
+
+
+def _average(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Changes]:
+    shares = avatar.output_shares(progress).to(inputs)
+    shares[-1] = _FASTER_OPACITY
+    for e in inputs:
+        weights, rest = averaging_weights(e)
+        neutral = rest * avatar.store["neutral_features"]
+        values = shares * blended_features(avatar.store["bases"], weights, neutral, avatar.bases_gradient)
+        yield Changes(values[:, :-1], values[:, -1] + start_logit().to(values))
+
+
+def _unpainted(means: Tensor, directions: int, config: HeadGasConfig) -> dict[str, Tensor]:
+    return {
+        **feature_tensors(means, directions, config.features),
+        "sh": means.new_zeros(len(means), colors_of(config) // 3, 3),
+        "opacity_logits": start_logit().to(means).repeat(len(means)),
+    }
+
+
+def _moving(directions: int, config: HeadGasConfig) -> nn.Sequential:
+    return new_network([config.features + encoded(config), config.hidden, MOVED], slice(None), opacity=False)
+
+
+def _moves(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Changes]:
+    first, _, last = avatar.network
+    layers, encoding = Layers(first.weight, first.bias, last.weight, last.bias), avatar.encoding()
+    shares = avatar.output_shares(progress)[:-1].to(encoding).view(-1, 3)
+    for e in inputs:
+        others, last_column = avatar.outputs(e, encoding, layers)
+        moved = torch.cat([others, last_column[:, None]], dim=-1)
+        yield Changes((shares * avatar.store["sh"]).flatten(1), avatar.store["opacity_logits"], moved)
+
+
+def _painting(directions: int, config: HeadGasConfig) -> nn.Sequential:
+    colors = colors_of(config)
+    sizes = [config.features + encoded(config), config.hidden, colors + MOVED + 1]
+    return new_network(sizes, slice(colors, colors + MOVED))
+
+
+def _paints_and_moves(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Changes]:
+    first, _, last = avatar.network
+    own, encoding = avatar.output_shares(progress).to(last.weight), avatar.encoding()
+    shares = torch.cat([own[:-1], own.new_ones(MOVED), own[-1:]])
+    layers = Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
+    for e in inputs:
+        others, opacity_logits = avatar.outputs(e, encoding, layers)
+        yield Changes(others[:, :-MOVED], opacity_logits, others[:, -MOVED:])
+
+
+def _deep(directions: int, config: HeadGasConfig) -> nn.Sequential:
+    return new_network([directions + encoded(config), *[config.hidden] * 4, colors_of(config) + 1])
+
+
+def _unblended(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Changes]:
+    shares, encoding = avatar.output_shares(progress).to(inputs), avatar.encoding()
+    for e in inputs:
+        values = shares * avatar.network(torch.cat([e.expand(len(encoding), -1), encoding], dim=-1))
+        yield Changes(values[:, :-1], values[:, -1])
+
+
+_AVERAGE = "its average of colours is not linear in the expression"
+_MOVES = "its network moves Gaussians"
+ABLATIONS: dict[Variant, Ablation] = {
+    "no_mlp": Ablation(_explicit, lambda k, config: nn.Sequential(), _average, _AVERAGE),
+    "delta": Ablation(_unpainted, _moving, _moves, _MOVES),
+    "change_all": Ablation(
+        lambda means, k, config: feature_tensors(means, k, config.features), _painting, _paints_and_moves, _MOVES
+    ),
+    "no_blending": Ablation(lambda means, k, config: {}, _deep, _unblended),
+}

@@ -16,32 +16,27 @@ learns the face model's motion before the first picture (`pretraining`), and eac
 those that the network gives to its position (`own_rate`).
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, Pretraining, network_group, store_group
-from mien.avatar.baked_pose import Kept, can_pose_baked, pose_baked
-from mien.avatar.baking import as_array, bake_rig
+from mien.avatar.avatar import Extras, ParameterGroup, Posed, Pretraining, network_group, store_group
+from mien.avatar.baking import Kept, as_array, can_pose_baked, pose_baked
 from mien.avatar.density import RefillDensity
-from mien.avatar.mono_gaussian_avatar.motion import AtRest, FaceWeights, PointMotion, canonical_face
+from mien.avatar.mono_gaussian_avatar.motion import FreePoints
 from mien.avatar.mono_gaussian_avatar.networks import (
     ATTRIBUTE_WIDTHS,
     ATTRIBUTES,
     AttributeChangeNet,
     AttributeNet,
-    DeformationNet,
 )
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, MonoGaussianAvatarConfig
 from mien.avatar.ops.activation import sigmoid
-from mien.avatar.schedules import TRAINED, Progress
-from mien.avatar.settings import RefillSettings
+from mien.avatar.settings import TRAINED, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
-from mien.avatar.surface_places import sample_surface
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
@@ -50,34 +45,23 @@ from mien.render.rendering import Rendering
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
 
 
-class MonoGaussianAvatar(Avatar):
+class MonoGaussianAvatar(FreePoints):
     """Free points. Networks predict attributes, blend directions and skinning weights."""
 
     config: MonoGaussianAvatarConfig
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
-        pretraining = Pretraining(config.pretraining, self._pretrain) if config.pretraining > 0 else None
+        pretraining = Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None
         super().__init__(
             config, face_model, face, Extras(frames_per_step=self._frames_per_step, pretraining=pretraining)
         )
         like = face_model.template
-        e, k = face.expression.shape[1], len(face_model.joint_names)
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
         self.attributes = AttributeNet(*sizes, config.sphere_start).to(like)
-        outputs = (e, 9 * face.joints.shape[1], k + 1)
-        self.deformation = DeformationNet(config.deformation_width, *outputs, config.skinning_norm).to(like)
+        self.deformation = self.new_deformation(face, skinning_norm=config.skinning_norm)
         self.change = AttributeChangeNet(config.change_width).to(like)
-        expression, joints = canonical_face(face_model, face.expression.detach().mean(0))
-        self.register_buffer("canonical_expression", expression)
-        self.register_buffer("canonical_joints", joints)
-        self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
-        self._baked, self._rest = Kept[BlendSkinned](), Kept[AtRest]()
-        if config.start == "sphere":
-            # Uniform in a cube, then projected onto the sphere, as in the published code.
-            cube = 2 * torch.rand(config.points, 3).to(like) - 1
-            means = config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)
-        else:
-            means = sample_surface(self.at_rest().vertices, face_model.faces, config.points)
+        means, self.by_variance = self.first_means(face), config.face_expression_by_variance
+        self._baked = Kept[BlendSkinned]()
         trained = {"means": means}
         if config.own_rate.start > 0:
             trained["own_attributes"] = means.new_zeros(config.points, sum(ATTRIBUTE_WIDTHS))
@@ -91,7 +75,7 @@ class MonoGaussianAvatar(Avatar):
         if not self.training and progress is TRAINED and can_pose_baked(self.store["means"], face):
             baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
             return Posed(pose_baked(baked, face), {})
-        means, displacement = self._motion.deformed(self.store["means"], face)
+        means, displacement = self.deformed(self.store["means"], face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
         raw = split_attributes(self._attributes_at_rest() + change)
@@ -106,38 +90,11 @@ class MonoGaussianAvatar(Avatar):
         """Fewer than the settings' if there are many points."""
         return max(1, min(self.config.frames_per_step, self.config.points_per_step // len(self.store)))
 
-    def canonical_face(self) -> FaceParams:
-        """The canonical expression and joints, at the subject's usual head pose."""
-        return self._motion.canonical_face()
-
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
-        """Distance of skinning weights and blend directions from those of the nearest canonical vertex.
-
-        Points are detached: these losses train the networks only. Each step uses the next `face_points` points; on
-        average, that is the paper's mean over all points. The squared difference of an expression direction is
-        multiplied by the mean variance of all coefficients over the training frames. The term then does not depend on
-        how a face model scales its coefficients (the paper's weights are for FLAME).
-        """
-        n = len(self.store)
-        turn = progress.step // progress.frames
-        chosen = torch.arange(turn * self.config.face_points, (turn + 1) * self.config.face_points)
-        means = self.store["means"].detach()
-        losses = self._motion.face_losses(means[chosen[:n].to(means.device) % n], self._face_weights())
+        """`face_losses` of the next points, whose weight falls. They train the networks only."""
+        losses = self.face_losses(self.chosen_means(progress))
         weight = self._schedule().face_decay(progress.fraction)
         return {name: weight * loss for name, loss in losses.items()}
-
-    def _face_weights(self) -> FaceWeights:
-        config = self.config
-        by_variance = config.face_expression_by_variance
-        weights = (config.face_skinning_weight, config.face_expression_weight, config.face_correctives_weight)
-        return FaceWeights(*weights, self.get_buffer("expression_variance"), by_variance)
-
-    def _pretrain(self, face: FaceParams) -> Iterator[None]:
-        """Teach the deformation network the face model's motion in training frames.
-
-        The published network starts without any motion, and needs some hundred thousand steps to find it.
-        """
-        yield from self._motion.learn(face, self.config.pretraining, self._face_weights())
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group for the points, and one per network."""
@@ -148,10 +105,6 @@ class MonoGaussianAvatar(Avatar):
             groups.append(store_group(self.store, "own_attributes", self.config.own_rate))
         groups += [network_group(name, network, rate) for name, network in networks.items()]
         return [replace(group, halvings=halvings, epsilon=self.config.adam_epsilon) for group in groups]
-
-    def gaussian_store(self) -> GaussianStore:
-        """The store of points. Everything else comes from networks."""
-        return self.store
 
     def density(self) -> RefillDensity:
         """Deletes points that no view of the last epoch has shown, then refills up to the scheduled number."""
@@ -173,7 +126,7 @@ class MonoGaussianAvatar(Avatar):
     @torch.no_grad()
     def bake(self) -> BlendSkinned:
         """Points with blend directions and skinning weights, raw attributes, and the network that changes them."""
-        motion = self._motion.baked(self.store["means"], bake_rig(self.face_model, self.subject))
+        motion = self.baked_motion()
         raw = split_attributes(self._attributes_at_rest())
         layers = self.change.layers()
         # The network takes the motion from the canonical position, but the runtime gives the motion from the rest
@@ -216,15 +169,6 @@ class MonoGaussianAvatar(Avatar):
     def _schedule(self) -> Schedule:
         config = self.config
         return Schedule(config.schedule, config.epochs, config.points, config.first_epoch, config.late_epoch)
-
-    @property
-    def _motion(self) -> PointMotion:
-        own = (self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints"))
-        return PointMotion(self.face_model, self.subject, self.deformation, *own, self._rest)
-
-    def at_rest(self) -> AtRest:
-        """What depends on the canonical face alone."""
-        return self._motion.at_rest()
 
 
 def split_attributes(raw: Float[Tensor, "*b 11"]) -> dict[str, Tensor]:

@@ -4,9 +4,10 @@ Points deform by blend directions and skinning weights that the network says abo
 model's joints there is one more bone, which stands still in the world while the head moves.
 """
 
+from abc import ABC
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,12 +15,13 @@ from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from mien.arrays import is_native
-from mien.avatar.baked_pose import Kept
-from mien.avatar.baking import as_array
+from mien.avatar.avatar import Avatar
+from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.ops.points import at_places, random_places, sample_surface
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
-from mien.avatar.surface_places import at_places, random_places
+from mien.avatar.settings import Progress
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform
@@ -55,35 +57,40 @@ class BakedMotion(NamedTuple):
     still_pose: Float32[np.ndarray, "4 4"]
 
 
-class FaceWeights(NamedTuple):
-    """Weights of the losses near the face model."""
+class FreePoints(Avatar, ABC):
+    """Points that a network moves with the face, from the canonical one to others."""
 
-    skinning: float
-    expression: float
-    correctives: float
-    variance: Float[Tensor, " e"]
-    """Variance of each expression coefficient over the training frames."""
+    config: Any
+    """`MonoGaussianAvatarConfig`, or `PointAvatarConfig`, which has the same names for what is used here."""
+    deformation: DeformationNet
+    canonical_expression: Tensor
+    canonical_joints: Tensor
+    expression_variance: Tensor
     by_variance: bool
-    """Whether a coefficient's term is divided by its variance, relative to the mean of all, and by their number."""
+    """Whether a coefficient's loss is divided by its variance, relative to the mean of all, and by their number."""
 
+    def new_deformation(self, face: FaceParams, *, skinning_norm: bool) -> DeformationNet:
+        """The network for faces of this kind, with random weights."""
+        outputs = (face.expression.shape[1], 9 * face.joints.shape[1], len(self.face_model.joint_names) + 1)
+        return DeformationNet(self.config.deformation_width, *outputs, skinning_norm).to(self.face_model.template)
 
-@dataclass(frozen=True, eq=False)
-class PointMotion:
-    """The motion of one avatar's points."""
-
-    face_model: FaceModel
-    subject: FaceParams
-    network: DeformationNet
-    expression: Float[Tensor, " e"]
-    """Expression of the canonical face."""
-    joints: Float[Tensor, "j 3"]
-    """Joints of the canonical face."""
-    kept: Kept[AtRest]
-    """Keeps what depends on the canonical face alone."""
+    def first_means(self, face: FaceParams) -> Float[Tensor, "n 3"]:
+        """Take the canonical face from all training timesteps, and return the first points: on it, or on a sphere."""
+        config, like = self.config, self.face_model.template
+        expression, joints = canonical_face(self.face_model, face.expression.detach().mean(0))
+        self.register_buffer("canonical_expression", expression)
+        self.register_buffer("canonical_joints", joints)
+        self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
+        self._kept_rest = Kept[AtRest]()
+        if config.start == "sphere":
+            # Uniform in a cube, then projected onto the sphere, as in the published code.
+            cube = 2 * torch.rand(config.points, 3).to(like) - 1
+            return config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)
+        return sample_surface(self.at_rest().vertices, self.face_model.faces, config.points)
 
     def canonical_face(self) -> FaceParams:
         """The canonical expression and joints, at the subject's usual head pose."""
-        return replace(self.subject, expression=self.expression[None], joints=self.joints[None])
+        return replace(self.subject, expression=self.canonical_expression[None], joints=self.canonical_joints[None])
 
     def transforms(self, face: FaceParams) -> Float[Tensor, "b k 3 4"]:
         """The joints' transforms in the head frame, then that of the bone which stands still in the world."""
@@ -99,7 +106,8 @@ class PointMotion:
             vertices, transforms = self.face_model.head_vertices(face)[0], self.transforms(face)[0]
             return AtRest(vertices, transforms, self.coefficients(face, absolute=True))
 
-        return self.kept.of((self.expression, self.joints, *self.subject.tensors().values()), make)
+        own = (self.canonical_expression, self.canonical_joints, *self.subject.tensors().values())
+        return self._kept_rest.of(own, make)
 
     def coefficients(self, face: FaceParams, absolute: bool = False) -> Float[Tensor, "b c"]:
         """Weights of the blend directions: less those of the canonical face, or as they are (`absolute`)."""
@@ -110,41 +118,49 @@ class PointMotion:
         self, means: Float[Tensor, "n 3"], face: FaceParams
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Points in the head frame, and their motion from the canonical positions, both in metres."""
-        offset, moved, weights = self.network(means / LENGTH_UNIT, self.coefficients(face))
+        offset, moved, weights = self.deformation(means / LENGTH_UNIT, self.coefficients(face))
         canonical = means + LENGTH_UNIT * offset
         at_rest = self.at_rest().transforms
         posed = skin_points(canonical, LENGTH_UNIT * moved, weights, at_rest, self.transforms(face))
         return posed, posed - canonical
 
-    def face_losses(self, means: Float[Tensor, "p 3"], known: FaceWeights) -> dict[str, Float[Tensor, ""]]:
-        """Distances of some points' skinning weights and directions from those of the nearest canonical vertex.
+    def face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
+        """Weighted distances of points' skinning weights and directions from those of the nearest canonical vertex.
 
         The squared difference of an expression direction is multiplied by the mean variance of all coefficients over
-        the training frames. Nearest vertices are found in each step, because points move: of points that have moved by
-        a millimetre, 12 % have another one. For the paper's 100,000 points they take 4 % of the time of these losses.
+        the training frames. The term then does not depend on how a face model scales its coefficients (the paper's
+        weights are for FLAME). Nearest vertices are found in each step, because points move.
         """
         model = self.face_model
-        found = self.network.whole(means / LENGTH_UNIT)
+        found = self.deformation.whole(means / LENGTH_UNIT)
         canonical = means + LENGTH_UNIT * found.offset.detach()
         nearest = nearest_vertices(canonical, self.at_rest().vertices)
         # The bone that stands still belongs to no vertex.
         weights = torch.nn.functional.pad(model.skinning_weights[nearest], (0, 1))
-        losses = {"skinning": known.skinning * _mean_square(found.weights - weights)}
+        config, variance = self.config, self.expression_variance
+        losses = {"skinning": config.face_skinning_weight * _mean_square(found.weights - weights)}
         difference = found.expression - model.expression_basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
-        unit = known.variance.mean().clamp_min(1e-8)
-        if known.by_variance:
+        unit = variance.mean().clamp_min(1e-8)
+        if self.by_variance:
             # Coefficients that never moved would otherwise have an infinite weight.
-            unit = unit / ((known.variance / unit).clamp_min(0.01) * len(known.variance))
-        losses["expression_directions"] = known.expression * _mean_square(difference * unit.sqrt())
+            unit = unit / ((variance / unit).clamp_min(0.01) * len(variance))
+        losses["expression_directions"] = config.face_expression_weight * _mean_square(difference * unit.sqrt())
         if found.pose.shape[-1] > 0:
             basis = model.pose_basis
             correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
-            losses["pose_correctives"] = known.correctives * _mean_square(found.pose - correctives)
+            losses["pose_correctives"] = config.face_correctives_weight * _mean_square(found.pose - correctives)
         return losses
 
-    def baked(self, means: Float[Tensor, "n 3"], rig: Rig) -> BakedMotion:
+    def chosen_means(self, progress: Progress) -> Float[Tensor, "p 3"]:
+        """The next `face_points` points, detached: on average, losses of them are the paper's means over all points."""
+        n, count, turn = len(self.store), self.config.face_points, progress.step // progress.frames
+        means, chosen = self.store["means"].detach(), torch.arange(turn * count, (turn + 1) * count)
+        return means[chosen[:n].to(means.device) % n]
+
+    def baked_motion(self) -> BakedMotion:
         """The points as those of a rig with blend directions and skinning weights."""
-        found = self.network.whole(means / LENGTH_UNIT)
+        means, rig = self.store["means"], bake_rig(self.face_model, self.subject)
+        found = self.deformation.whole(means / LENGTH_UNIT)
         expression, pose = LENGTH_UNIT * found.expression, LENGTH_UNIT * found.pose
         face = self.canonical_face()
         canonical = means + LENGTH_UNIT * found.offset
@@ -161,9 +177,15 @@ class PointMotion:
         still = (as_array(found.weights[:, -1]), as_array(face.T_world_head[0]))
         return BakedMotion(moved, rest - canonical, *still)
 
-    def learn(self, face: FaceParams, steps: int, known: FaceWeights) -> Iterator[None]:
-        """Teach the network the face model's motion in training frames, before the first picture."""
-        optimizer = torch.optim.Adam(self.network.parameters(), lr=_PRETRAINING_RATE)
+    def pretrain(self, face: FaceParams) -> Iterator[None]:
+        """Teach the network the face model's motion in training frames, before the first picture.
+
+        The published network starts without any motion, and needs some hundred thousand steps to find it.
+        """
+        steps, optimizer = (
+            self.config.pretraining,
+            torch.optim.Adam(self.deformation.parameters(), lr=_PRETRAINING_RATE),
+        )
         canonical, faces = self.at_rest().vertices, self.face_model.faces
         for step in range(steps):
             optimizer.param_groups[0]["lr"] = _PRETRAINING_RATE * 0.1 ** (step / steps)
@@ -174,7 +196,7 @@ class PointMotion:
             found, _ = self.deformed(means, frames)
             distance = (found - target).norm(dim=-1).mean() / LENGTH_UNIT
             optimizer.zero_grad()
-            losses = self.face_losses(means, known)
+            losses = self.face_losses(means)
             torch.autograd.backward([_PRETRAINING_WEIGHT * distance, *losses.values()])
             optimizer.step()
             yield
@@ -183,7 +205,7 @@ class PointMotion:
 def canonical_face(
     model: FaceModel, expression: Float[Tensor, " e"]
 ) -> tuple[Float[Tensor, " e"], Float[Tensor, "j 3"]]:
-    """An expression and joints at which the jaw is open by `MONO.canonical_jaw`.
+    """An expression and joints at which the jaw is open by `CANONICAL_JAW`.
 
     A free jaw turns by this angle. A jaw that follows the expression gets it from the coefficient that opens it most.
     Other joints are at rest. A model without a joint `jaw` keeps its jaw.
@@ -224,7 +246,6 @@ def _pose_features(face: FaceParams) -> Float[Tensor, "b p"]:
 
 
 def _inverse(pose: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
-    """The inverses of rigid transforms."""
     turned = pose[:, :3, :3].transpose(1, 2)
     return rigid_transform(turned, -(turned @ pose[:, :3, 3:])[..., 0])
 

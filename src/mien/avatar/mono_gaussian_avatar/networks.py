@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from mien.avatar.encoding import positional_encoding
 from mien.avatar.ops.point_network import Activation, Layer, point_network
+from mien.avatar.ops.points import positional_encoding
 
 _SKINNING_SHARPNESS = 20.0
 """Factor on the logits of the skinning weights: their softmax has a temperature of 1/20. As published."""
@@ -32,14 +32,8 @@ ATTRIBUTE_WIDTHS = (3, 4, 1, 3)
 class AttributeNet(nn.Module):
     """Raw attributes of a point at rest, given its position.
 
-    The trunk has weight normalisation, the heads have none.
-
-    Args:
-        width: Width of all layers.
-        layers: Number of layers of the trunk.
-        bands: Number of octaves of the encoding of positions.
-        sphere: Whether the trunk starts as about the signed distance to a sphere, as published. Otherwise its last
-            layer starts as the others do.
+    The trunk has weight normalisation, the heads have none. With `sphere`, the trunk starts as about the signed
+    distance to a sphere, as published.
     """
 
     def __init__(self, width: int, layers: int, bands: int, sphere: bool = True):
@@ -100,13 +94,7 @@ class Deformation(NamedTuple):
 class DeformationNet(nn.Module):
     """Offset, blend directions and skinning weights of a point, given its position. At first zero, zero, equal.
 
-    Args:
-        width: Width of all layers.
-        expressions: Number of expression coefficients.
-        pose_features: Number of features of the joints' rotations.
-        bones: Number of skinning weights.
-        skinning_norm: Whether the hidden layer of the skinning weights starts as the trunk's and has weight
-            normalisation, as published. Otherwise it is a plain layer.
+    With `skinning_norm`, the hidden layer of the skinning weights has weight normalisation, as published.
     """
 
     def __init__(self, width: int, expressions: int, pose_features: int, bones: int, skinning_norm: bool = False):
@@ -127,10 +115,6 @@ class DeformationNet(nn.Module):
 
         The layer of directions is linear, so its weights are summed in place of the directions: exactly the same sums
         for a fraction of the work.
-
-        Args:
-            points: Positions.
-            coefficients: Weights of the expression directions, then of the pose correctives, of each timestep.
         """
         weight, bias = self._directions()
         weight = torch.cat([weight[:, 0], torch.einsum("bc,xcw->bxw", coefficients, weight[:, 1:]).flatten(0, 1)])
@@ -191,7 +175,6 @@ class AttributeChangeNet(nn.Module):
 
 
 def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:
-    """Layers with the same input as one."""
     return Layer(torch.cat([layer.weight for layer in layers]), torch.cat([layer.bias for layer in layers]), activation)
 
 

@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
+from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric, Rate
 from mien.disk.config import NOT_NEGATIVE, Above, Range, ToLoad
 
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 _WIDTH = Range(1, 1024)
-_RATE = Rate(4e-4, begin=0.1)
+_FACE_RATE = 4e-4
 
 
 @dataclass(frozen=True)
@@ -22,24 +21,19 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """
 
     photometric: Photometric = Photometric(l1_weight=1.0, ssim_weight=0.25)
-    """Weights of the losses that compare a rendering with its target. The weights of L1 and 1 - SSIM are the
-    paper's."""
+    """Losses of pictures. The weights of L1 and 1 - SSIM are the paper's."""
     face_tuning: FaceTuning = FaceTuning(
-        expression=_RATE, joints=_RATE, head_rotation=_RATE, head_translation=Rate(1.2e-4, begin=0.1)
+        expression=_FACE_RATE, joints=_FACE_RATE, head_rotation=_FACE_RATE, head_translation=1.2e-4, begin=0.1
     )
-    """Whether and how fast training changes the tracked face parameters of each frame. This begins after a tenth of
-    the run; in the paper, with epoch 10."""
+    """Whether and how fast the tracked face parameters change. In the paper, this begins with epoch 10."""
     frames_per_step: Annotated[int, Range(1, 64)] = 2
-    """Largest number of frames that one optimiser step uses. They share what depends on the points alone, so that a
-    frame takes less time; but the run then has fewer updates, since each frame counts as a step."""
+    """Largest number of frames of an optimiser step. They share what depends on the points alone."""
     points_per_step: Annotated[int, Range(1, 100_000_000)] = 102_400
-    """Largest number of points, summed over the frames of an optimiser step. With more points, steps have fewer
-    frames, but at least one."""
+    """Largest number of points, summed over the frames of an optimiser step."""
     start: Literal["sphere", "face"] = "face"
     """Points start on a sphere around the head, or on the surface of the face model."""
     pretraining: Annotated[int, Range(0, 1_000_000)] = 1_000
-    """Number of steps before the first picture, in which the deformation network learns how the face model
-    moves."""
+    """Number of steps before the first picture, in which a network learns how the face model moves."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 10_000
     """Number of Gaussians at the start."""
     sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
@@ -50,55 +44,46 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """The paper's epoch with which the run ends. After each epoch, points are pruned and refilled; number of points,
     radii and the weight of the face model's terms follow the epochs."""
     first_epoch: Annotated[int, Range(0, 100_000)] = 60
-    """The paper's epoch with which the run begins. It has to be smaller than `epochs`. Points that start on the face
-    need no large radii."""
+    """The paper's epoch with which the run begins. Points that start on the face need no large radii."""
     schedule: Literal["paper", "code"] = "code"
-    """Whose numbers of points and radii: those of the paper, whose children are on a sphere around their parents, or
-    those of the published code, whose children are in a cube."""
+    """Whose numbers of points and radii: the paper's, with children on a sphere around their parents, or those of the
+    published code, with children in a cube."""
     late_epoch: Annotated[int, Range(1, 100_000)] = 102
-    """The paper's epoch with whose start new points are first put 0.001 m from their parents, whatever the radius
-    (published code: 101)."""
+    """The paper's epoch with whose start new points are put 0.001 m from their parents (published code: 101)."""
     attribute_width: Annotated[int, _WIDTH] = 64
     """Width of the attribute network."""
     attribute_layers: Annotated[int, Range(1, 32)] = 3
-    """Number of layers of the attribute network's trunk. The fourth reads the encoding of positions again,
-    if the network is wider than that."""
+    """Number of layers of its trunk. The fourth reads the encoding of positions again, if it fits."""
     encoding_bands: Annotated[int, Range(0, 24)] = 9
-    """Number of octaves of the attribute network's encoding of positions. The shortest wave is 6 mm; with 6
-    octaves, it is 49 mm."""
+    """Number of octaves of its encoding of positions. The shortest wave is 6 mm; with 6 octaves, 49 mm."""
     sphere_start: bool = False
-    """Whether the attribute network's trunk starts as about the signed distance to a sphere, as in the paper."""
+    """Whether its trunk starts as about the signed distance to a sphere, as in the paper."""
     deformation_width: Annotated[int, _WIDTH] = 64
     """Width of the deformation network."""
     skinning_norm: bool = False
-    """Whether the hidden layer of the skinning weights has weight normalisation and starts as the layers before it, as
-    published."""
+    """Whether the hidden layer of the skinning weights has weight normalisation, as published."""
     change_width: Annotated[int, _WIDTH] = 32
     """Width of the network that changes attributes with motion."""
     scale_gain: Annotated[float, Range(0, 1000)] = 0.00625
-    """Largest scale that the networks add to the radius that all points share, in metres (paper: 0.0025 for pictures of
-    1024x1024)."""
+    """Largest scale that the networks add to the radius of all points, in metres (paper: 0.0025 at 1024x1024)."""
     means_rate: Rate = Rate(1e-4, 1e-5)
     """Learning rate of the points, in metres per step."""
     network_rate: Rate = Rate(5e-4, 5e-5)
     """Learning rate of the networks, per step. The paper's is smaller, over some hundred thousand steps."""
     own_rate: Rate = Rate(5e-2, 2e-3)
-    """Learning rate of each point's own attributes, per step. They are added to the raw attributes that the network
-    predicts for its position, which are smooth. With 0, points have none."""
+    """Learning rate of what each point adds to the attributes of its position, per step. With 0, nothing."""
     adam_epsilon: Annotated[float, EPSILON_RANGE] = 1e-15
-    """Adam's epsilon for points and networks. With another one than 1e-15, steps take longer, because only that one is
-    in the native code (published code: 1e-8)."""
+    """Adam's epsilon for points and networks. Only 1e-15 is in the native code (published code: 1e-8)."""
     rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
-    """Times at which the rates of points and networks are halved, as fractions of the run (paper: epochs 80 and
-    100)."""
+    """Times at which their rates are halved, as fractions of the run (paper: epochs 80 and 100)."""
     face_skinning_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the mean squared distance of a point's skinning weights from those of the nearest vertex. This weight
-    and the two below keep the networks near the face model. All three halve at epochs 20, 30, 50 and 70."""
+    and the two below halve at epochs 20, 30, 50 and 70."""
     face_expression_weight: Annotated[float, NOT_NEGATIVE] = 1e4
     """Weight of the same distance of expression directions, in units where the coefficients' mean variance is 1."""
     face_expression_by_variance: bool = True
-    """Whether the term of a coefficient is also divided by its variance, relative to the mean of all, and by the number
-    of coefficients, as in the published code; the supplement has neither."""
+    """Whether a coefficient's term is also divided by its variance and by the number of coefficients, as in the
+    published code; the supplement has neither."""
     face_correctives_weight: Annotated[float, NOT_NEGATIVE] = 1e4
     """Weight of the same distance of pose correctives."""
     face_points: Annotated[int, GAUSSIAN_COUNT] = 256
@@ -107,14 +92,14 @@ class MonoGaussianAvatarConfig(MethodConfig):
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500
 """The preset `paper` spans the epochs up to which results are published, over a video of 100 seconds."""
-_PAPER_RATE = {"start": 5e-4, "begin": 10 / _PAPER_EPOCHS}
 _PAPER: dict[str, Any] = {
     "photometric": {"perceptual": {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3}},
     "face_tuning": {
-        "expression": _PAPER_RATE,
-        "joints": _PAPER_RATE,
-        "head_rotation": _PAPER_RATE,
-        "head_translation": {"start": 0.0, "begin": 0.0},
+        "expression": 5e-4,
+        "joints": 5e-4,
+        "head_rotation": 5e-4,
+        "head_translation": 0.0,
+        "begin": 10 / _PAPER_EPOCHS,
     },
     "frames_per_step": 8,
     "start": "sphere",

@@ -1,6 +1,5 @@
 """Bound Gaussians: posing of the face, frames of the triangles and opacities as one operation."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -10,9 +9,9 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.arrays import unpacked
+from mien.avatar.ops import Tensors
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
-from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import compiled_model, has_native_posing, head_poses
@@ -24,7 +23,7 @@ _LOCAL = ("means", "quats", "log_scales", "opacity_logits")
 def pose_bound_gaussians(
     face_model: FaceModel,
     face: FaceParams,
-    store: GaussianStore | Mapping[str, Tensor],
+    store: Tensors,
     sh: Float[Tensor, "n k 3"],
     in_head: bool,
 ) -> Gaussians:
@@ -52,7 +51,7 @@ def pose_bound_gaussians(
 def pose_bound_gaussians_reference(
     face_model: FaceModel,
     face: FaceParams,
-    store: GaussianStore | Mapping[str, Tensor],
+    store: Tensors,
     sh: Float[Tensor, "n k 3"],
     in_head: bool,
 ) -> Gaussians:

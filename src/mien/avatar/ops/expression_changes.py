@@ -41,10 +41,7 @@ class ExpressionActivations(nn.Module):
     def __init__(self, face: FaceParams, neutral: FaceParams, rank: int):
         """Take the directions, and the range of the activations, from the timesteps of `face`.
 
-        Args:
-            face: Face parameters of all training timesteps.
-            neutral: One timestep: the person at rest, whose activations are 0.
-            rank: Number of activations, at least 1. Directions that the timesteps do not have are 0.
+        Directions that the timesteps do not have are 0.
         """
         super().__init__()
         rest = expression_inputs(neutral)[0]

@@ -51,13 +51,7 @@ def feature_network(
 ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
     """All outputs but the last, and the last. Differentiable in everything.
 
-    Args:
-        bases: Bases of the features. Their gradient goes to `gradient`.
-        inputs: Weights of the bases at one timestep.
-        neutral: Features where all inputs are 0.
-        own: Numbers of each Gaussian that go into the network beside its features.
-        layers: The network.
-        gradient: Takes the gradient of the bases, if they require one.
+    The gradient of the bases goes to `gradient`. `own` are numbers of each Gaussian beside its features.
     """
     return _Network.apply(gradient, bases, inputs, neutral, own, *layers)
 

@@ -38,12 +38,7 @@ def skin_points(
 ) -> Float[Tensor, "b n 3"]:
     """Places of points in other poses. Differentiable in everything but `from_bones`.
 
-    Args:
-        points: Places in the first pose.
-        moved: What is added to the places at rest, in each of the other poses.
-        weights: Skinning weights.
-        from_bones: Transforms of the bones in the first pose.
-        to_bones: Transforms of the bones in the other poses.
+    `points` are in the first pose. `moved` is added at rest, for each of the other poses.
     """
     return _SkinPoints.apply(points, moved, weights, from_bones, to_bones)
 

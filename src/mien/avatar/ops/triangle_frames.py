@@ -134,11 +134,7 @@ def bind_to_world(
 
 
 def rig_topology(vertex_count: int, faces: Int[Tensor, "f 3"], face_index: Int[Tensor, " n"]) -> _native.RigTopology:
-    """The Gaussians on each triangle, in the form that the core takes. Cached until `face_index` changes.
-
-    Raises:
-        IndexError: a vertex or a face does not exist.
-    """
+    """The Gaussians on each triangle, in the form that the core takes. Cached until `face_index` changes."""
     known, versions = _topologies.get(face_index), (faces._version, face_index._version)
     if known is None or known.faces is not faces or known.versions != versions or known.vertex_count != vertex_count:
         topology = _native.make_rig_topology(vertex_count, faces.contiguous(), face_index.contiguous())
@@ -148,8 +144,6 @@ def rig_topology(vertex_count: int, faces: Int[Tensor, "f 3"], face_index: Int[T
 
 @dataclass(frozen=True, eq=False)
 class _Topology:
-    """A topology, with the tensors that it was made from and their versions."""
-
     topology: _native.RigTopology
     vertex_count: int
     faces: Tensor

@@ -41,13 +41,6 @@ def triangle_penalties(
 
     Lengths are in units of the triangle's size. `thresholds` and `weights` hold the value for centres, then for scales.
     Differentiable in `means` and `log_scales`; native for float32 on a CPU.
-
-    Args:
-        means: Centres in the frames of their triangles.
-        log_scales: Logarithms of the scales in the same units.
-        radii: Radii on screen in pixels, 0 if not visible.
-        thresholds: Distance and scale up to which there is no penalty.
-        weights: Weights of the two penalties.
     """
     return _TrianglePenalties.apply(means, log_scales, radii, thresholds, weights)
 

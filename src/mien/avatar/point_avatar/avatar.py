@@ -13,7 +13,7 @@ the surface are a choice made here; the canonical face and the bone that stands 
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float, Int
@@ -21,7 +21,6 @@ from torch import Tensor
 
 from mien.avatar.avatar import (
     UNBAKED_REMEDY,
-    Avatar,
     Extras,
     ParameterGroup,
     Posed,
@@ -29,20 +28,16 @@ from mien.avatar.avatar import (
     network_group,
     store_group,
 )
-from mien.avatar.baked_pose import Kept
-from mien.avatar.baking import as_array, bake_rig
+from mien.avatar.baking import as_array
 from mien.avatar.density import RefillDensity
-from mien.avatar.mono_gaussian_avatar.motion import AtRest, FaceWeights, PointMotion, canonical_face
-from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
+from mien.avatar.mono_gaussian_avatar.motion import FreePoints
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.skin_points import blend_transforms
 from mien.avatar.point_avatar.networks import ShadingNet, SurfaceNet
 from mien.avatar.point_avatar.settings import PointAvatarConfig
-from mien.avatar.schedules import TRAINED, Progress
-from mien.avatar.settings import RefillSettings
+from mien.avatar.settings import TRAINED, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
-from mien.avatar.surface_places import sample_surface
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -56,7 +51,7 @@ _OPACITY = 0.99
 _UNBAKED = "the setting normals deformed of point_avatar: light on deformed normals is no function of the expression"
 
 
-class PointAvatar(Avatar):
+class PointAvatar(FreePoints):
     """Isotropic points with one radius. Networks predict colours, blend directions and skinning weights."""
 
     config: PointAvatarConfig
@@ -68,32 +63,21 @@ class PointAvatar(Avatar):
             face,
             Extras(
                 frames_per_step=lambda: config.frames_per_step,
-                pretraining=Pretraining(config.pretraining, self._pretrain) if config.pretraining > 0 else None,
+                pretraining=Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None,
                 unbaked=_UNBAKED if config.normals == "deformed" else None,
                 closing=config.closing,
             ),
         )
         like = face_model.template
-        e, k = face.expression.shape[1], len(face_model.joint_names)
         self.surface_net = SurfaceNet(config.surface_width, config.surface_layers, config.encoding_bands).to(like)
-        outputs = (e, 9 * face.joints.shape[1], k + 1)
-        self.deformation = DeformationNet(config.deformation_width, *outputs, skinning_norm=True).to(like)
+        self.deformation = self.new_deformation(face, skinning_norm=True)
         self.shading = ShadingNet(config.shading_width).to(like)
-        expression, joints = canonical_face(face_model, face.expression.detach().mean(0))
-        self.register_buffer("canonical_expression", expression)
-        self.register_buffer("canonical_joints", joints)
-        self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
-        self._rest = Kept[AtRest]()
-        if config.start == "sphere":
-            cube = 2 * torch.rand(config.points, 3).to(like) - 1
-            means = config.sphere_radius * torch.nn.functional.normalize(cube, dim=-1)
-        else:
-            means = sample_surface(self.motion.at_rest().vertices, face_model.faces, config.points)
-        self.store = GaussianStore({"means": means})
+        self.by_variance = False
+        self.store = GaussianStore({"means": self.first_means(face)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The points in the head frame, one batch entry per timestep, as Gaussians."""
-        means, _ = self.motion.deformed(self.store["means"], face)
+        means, _ = self.deformed(self.store["means"], face)
         colors = self._colors(face)
         sh = sh_from_rgb(colors)[..., None, :]
         like, n = means.detach(), len(self.store)
@@ -112,14 +96,10 @@ class PointAvatar(Avatar):
 
         Each step uses the next `face_points` points.
         """
-        config, n = self.config, len(self.store)
-        turn = progress.step // progress.frames
-        chosen = torch.arange(turn * config.face_points, (turn + 1) * config.face_points)
-        means = self.store["means"].detach()
-        means = means[chosen[:n].to(means.device) % n]
+        config, means = self.config, self.chosen_means(progress)
         surface = self.surface_net(means / LENGTH_UNIT)
         return {
-            **self.motion.face_losses(means, self._face_weights()),
+            **self.face_losses(means),
             "distance": config.distance_weight * surface.distance.square().mean(),
             "slope": config.slope_weight * (surface.slope.norm(dim=-1) - 1).square().mean(),
         }
@@ -129,10 +109,6 @@ class PointAvatar(Avatar):
         networks = {"surface": self.surface_net, "deformation": self.deformation, "shading": self.shading}
         groups = [network_group(name, network, self.config.network_rate) for name, network in networks.items()]
         return [store_group(self.store, "means", self.config.means_rate), *groups]
-
-    def gaussian_store(self) -> GaussianStore:
-        """The store of points. Everything else comes from networks."""
-        return self.store
 
     def density(self) -> RefillDensity:
         """Deletes points that no picture of the last epoch showed, then refills up to the scheduled number."""
@@ -154,7 +130,7 @@ class PointAvatar(Avatar):
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         n, own = len(self.store), self.store["means"]
-        motion = self.motion.baked(own, bake_rig(self.face_model, self.subject))
+        motion = self.baked_motion()
         attributes = Attributes(
             quats=as_array(own.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)),
             log_scales=as_array(own.new_full((n, 3), math.log(self.radius(1.0) / 2))),
@@ -162,12 +138,6 @@ class PointAvatar(Avatar):
             sh=as_array(sh_from_rgb(self._colors(self.subject))[:, None]),
         )
         return BlendSkinned(motion.rig, attributes, still_weights=motion.still_weights, still_pose=motion.still_pose)
-
-    @property
-    def motion(self) -> PointMotion:
-        """How points move with the face model."""
-        own = (self.get_buffer("canonical_expression"), self.get_buffer("canonical_joints"))
-        return PointMotion(self.face_model, self.subject, self.deformation, *own, self._rest)
 
     def points_at(self, fraction: float) -> int:
         """The number of points that an epoch begins with."""
@@ -189,8 +159,8 @@ class PointAvatar(Avatar):
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], face: FaceParams
     ) -> Float[Tensor, "b n 3"]:
         """Normals of the skinned points in the world, of length 1."""
-        motion, weights = self.motion, self.deformation.whole(points).weights
-        into, to = motion.at_rest().transforms[None], motion.transforms(face)
+        weights = self.deformation.whole(points).weights
+        into, to = self.at_rest().transforms[None], self.transforms(face)
         at_rest = blend_transforms(weights, into)[0, :, :, :3]
         skinned = blend_transforms(weights, to)[..., :3]
         # A normal turns by the inverse of the transpose, which is the matrix of cofactors, but for its length.
@@ -199,15 +169,6 @@ class PointAvatar(Avatar):
         cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-2)
         turned = (cofactors @ rested[..., None])[..., 0] @ head_poses(face)[:, :3, :3].transpose(1, 2)
         return torch.nn.functional.normalize(turned, dim=-1)
-
-    def _face_weights(self) -> FaceWeights:
-        config = self.config
-        weights = (config.face_skinning_weight, config.face_expression_weight, config.face_correctives_weight)
-        return FaceWeights(*weights, self.get_buffer("expression_variance"), by_variance=False)
-
-    def _pretrain(self, face: FaceParams) -> Iterator[None]:
-        """Teach the deformation network the face model's motion in training frames."""
-        yield from self.motion.learn(face, self.config.pretraining, self._face_weights())
 
 
 def was_drawn(gaussians: Gaussians, rendering: Rendering) -> Float[Tensor, " n"]:

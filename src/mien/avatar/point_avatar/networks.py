@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from mien.avatar.encoding import positional_encoding
+from mien.avatar.ops.points import positional_encoding
 
 _SHARPNESS = 100.0
 _SPHERE = 0.5

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from mien.avatar.schedules import Rate
-from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric
+from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric, Rate
 from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)
-_RATE = Rate(4e-4, begin=0.1)
+_FACE_RATE = 4e-4
 
 
 @dataclass(frozen=True)
@@ -20,18 +19,16 @@ class PointAvatarConfig(MethodConfig):
     """
 
     photometric: Photometric = Photometric(l1_weight=1.0, ssim_weight=0.25, alpha_weight=1.0)
-    """Weights of the losses that compare a rendering with its target. The paper has no SSIM."""
+    """Losses of pictures. The paper has no SSIM."""
     face_tuning: FaceTuning = FaceTuning(
-        expression=_RATE, joints=_RATE, head_rotation=_RATE, head_translation=Rate(1.2e-4, begin=0.1)
+        expression=_FACE_RATE, joints=_FACE_RATE, head_rotation=_FACE_RATE, head_translation=1.2e-4, begin=0.1
     )
-    """Whether and how fast training changes the tracked face parameters of each frame."""
     frames_per_step: Annotated[int, Range(1, 64)] = 2
     """Number of frames that one optimiser step uses. They share what depends on the points alone."""
     start: Literal["sphere", "face"] = "face"
     """Points start on a sphere around the head, or on the surface of the face model."""
     pretraining: Annotated[int, Range(0, 1_000_000)] = 1_000
-    """Number of steps before the first picture, in which the deformation network learns how the face model
-    moves."""
+    """Number of steps before the first picture, in which a network learns how the face model moves."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 5_000
     """Number of points at the start."""
     sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
@@ -39,8 +36,7 @@ class PointAvatarConfig(MethodConfig):
     max_points: Annotated[int, GAUSSIAN_COUNT] = 40_000
     """Largest number of points. Growth stops there."""
     epochs: Annotated[int, Range(1, 100_000)] = 40
-    """Number of epochs of the run. After each of them, points that no picture showed are pruned, and others are added
-    up to the number of the next epoch."""
+    """Number of epochs of the run. After each, points that no picture showed are replaced, up to the next number."""
     growth_epochs: Annotated[int, Range(1, 100_000)] = 5
     """Number of epochs after which the number of points doubles, and all get smaller."""
     first_radius: Annotated[float, Range(1e-4, 1)] = 0.0375
@@ -48,10 +44,10 @@ class PointAvatarConfig(MethodConfig):
     radius_factor: Annotated[float, Range(0.01, 1)] = 0.75
     """Factor on the radius each time that the number of points doubles."""
     normals: Literal["canonical", "deformed"] = "canonical"
-    """Normals that light is computed from. deformed: those of the moved points, in the world, as in the paper, so that
-    light changes while a head turns; such an avatar cannot be exported. canonical: those of the points at rest."""
+    """Normals that light is computed from: those of the points at rest (canonical), or of the moved points in the
+    world, as in the paper (deformed), which cannot be exported."""
     surface_width: Annotated[int, _WIDTH] = 64
-    """Width of the network that gives albedo and the distance to the surface, whose slope is the normal."""
+    """Width of the network that gives albedo and the distance to the surface."""
     surface_layers: Annotated[int, Range(1, 32)] = 3
     """Number of layers of that network before its outputs."""
     encoding_bands: Annotated[int, Range(0, 24)] = 6
@@ -77,23 +73,22 @@ class PointAvatarConfig(MethodConfig):
     slope_weight: Annotated[float, NOT_NEGATIVE] = 0.1
     """Weight of the mean squared difference of the distance's slope from 1, which makes it a distance."""
     closing: Annotated[int, Range(0, 15)] = 1
-    """Pixels in every direction by which finished pictures are eroded and then dilated, which closes holes up to twice
-    as wide. 0 leaves pictures as they are."""
+    """Pixels by which finished pictures are eroded and then dilated, which closes holes up to twice as wide."""
 
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 60, 2_500
 """The preset `paper` is a video of 100 seconds, over as many epochs as the number of points needs and 20 more."""
-_PAPER_RATE = {"start": 5e-4, "begin": 10 / _PAPER_EPOCHS}
 _PAPER: dict[str, Any] = {
     "photometric": {
         "ssim_weight": 0.0,
         "perceptual": {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3},
     },
     "face_tuning": {
-        "expression": _PAPER_RATE,
-        "joints": _PAPER_RATE,
-        "head_rotation": _PAPER_RATE,
-        "head_translation": {"start": 0.0, "begin": 0.0},
+        "expression": 5e-4,
+        "joints": 5e-4,
+        "head_rotation": 5e-4,
+        "head_translation": 0.0,
+        "begin": 10 / _PAPER_EPOCHS,
     },
     "frames_per_step": 1,
     "start": "sphere",

@@ -24,13 +24,11 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from mien.avatar.avatar import UNBAKED_REMEDY, Avatar, Extras, ParameterGroup, Posed, store_group
-from mien.avatar.baked_pose import Kept
-from mien.avatar.baking import as_array, bake_rig
-from mien.avatar.density import FixedDensity
+from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
 from mien.avatar.ops.triangle_frames import corners_in_frames, ellipses_of_corners, triangle_frames
-from mien.avatar.schedules import TRAINED, Progress
+from mien.avatar.settings import TRAINED, Progress
 from mien.avatar.store import GaussianStore
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
@@ -124,13 +122,8 @@ class TexturedMesh(Avatar):
             ParameterGroup("light", {"light": self.light}, config.light_rate),
         ]
 
-    def gaussian_store(self) -> GaussianStore:
-        """Every per-surfel tensor."""
-        return self.store
-
-    def density(self) -> FixedDensity:
+    def density(self) -> None:
         """The surfels stay where they are."""
-        return FixedDensity()
 
     @torch.no_grad()
     def bake(self) -> MeshBound:
@@ -177,11 +170,7 @@ class TexturedMesh(Avatar):
         return _AtRest(offsets, vertex_albedo, albedo, local, colors)
 
     def _surfels(self) -> Surfels:
-        """The places of the surfels of the store."""
-        try:
-            return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
-        except ValueError as error:
-            raise UserError(f"cannot be posed ({error})") from None
+        return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
 
     def _moved_subject(self, offsets: Float[Tensor, "v 3"]) -> FaceParams:
         own = self.subject.vertex_offsets
@@ -196,7 +185,6 @@ class TexturedMesh(Avatar):
         return offsets * self.get_buffer("movable"), albedo
 
     def _world_colors(self, face: FaceParams, albedo: Float[Tensor, "n 3"]) -> Float[Tensor, "b n 3"]:
-        """Colours under light that stands still in the world."""
         normals = self._normals(self.face_model.head_vertices(face))
         return albedo * shade(normals @ head_poses(face)[:, :3, :3].transpose(1, 2), self.light)
 

@@ -16,13 +16,7 @@ from torch.nn.functional import embedding_bag
 class Surfels(nn.Module):
     """The places of surfels on a mesh: those of one triangle follow each other, and so do triangles that are cut alike.
 
-    Args:
-        face_index: The triangle of each surfel, in that order.
-        faces: Number of triangles.
-        like: A tensor with the dtype of the coordinates.
-
-    Raises:
-        ValueError: `face_index` is in another order, or has other numbers of surfels.
+    Another order, or other numbers of surfels, are a ValueError.
     """
 
     def __init__(self, face_index: Int[Tensor, " n"], faces: int, like: Tensor):
@@ -87,12 +81,7 @@ def middles_of_parts(side: int) -> Float[Tensor, "k 3"]:
 
 
 class Neighbours(nn.Module):
-    """The vertices that share an edge with each vertex.
-
-    Args:
-        like: The vertices.
-        faces: The triangles.
-    """
+    """The vertices that share an edge with each vertex."""
 
     def __init__(self, like: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]):
         super().__init__()

@@ -19,7 +19,7 @@ from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device
 from mien.training.settings import MAIN_SETTINGS, PRESETS, Split, TrainSettings, doubly_held_out
-from mien.training.splits.named import NAMED_SPLIT
+from mien.training.settings.splits import NAMED_SPLIT
 
 if TYPE_CHECKING:
     PresetName = str
@@ -68,8 +68,7 @@ class TrainOptions:
     """Device for training. cpu: always the same bytes; cuda: an NVIDIA GPU, through gsplat (docs/using.md says how to
     install it); auto: a GPU if there is one. A run may resume on another device."""
     face_tuning: bool = True
-    """--face-tuning lets training correct the tracking, with interpolated corrections for held-out frames (the
-    default). --no-face-tuning keeps the tracking as it is."""
+    """Whether training corrects the tracking, with interpolated corrections for held-out frames (the default)."""
     training: _IN_DETAIL = None
     """The other settings of the run."""
     method_settings: _IN_DETAIL = None
@@ -170,7 +169,8 @@ def _with_defaults(method: str | None, preset: str, file: ConfigFile | None, arg
     if file:
         settings = overlay(settings, file.settings_changes, f"{file.path}: settings", "a run")
         config = overlay(config, file.method_changes, f"{file.path}: method", name)
-    own = leaves(config, "method")
+    # --face-tuning switches it.
+    own = [leaf for leaf in leaves(config, "method") if leaf.name != "face_tuning.enabled"]
     check_names(arguments, "method", own, name)
     rest = [one.name for one in fields(settings) if one.name not in MAIN_SETTINGS]
     presets = method_named(name).presets

@@ -13,7 +13,7 @@ from functools import partial
 from operator import attrgetter
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from mien.avatar.schedules import Rate
+from mien.avatar.settings import Rate
 from mien.commands.parsing.help_text import field_docs
 from mien.disk.config import Range, no_such_setting, range_of, shown
 from mien.errors import UserError

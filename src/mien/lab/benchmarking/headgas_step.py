@@ -73,6 +73,7 @@ def headgas_case(
     avatar = state.avatar
     assert isinstance(avatar, HeadGas)
     _fill(avatar, count)
+    assert state.density is not None
     state.density.load_state(empty_statistics(count))
     paint_targets(sequence, avatar, torch.zeros(()))
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)

@@ -67,6 +67,7 @@ def mono_case(
     assert isinstance(state.avatar, MonoGaussianAvatar)
     _fill(state.avatar, count)
     state.step = _LATE_STEP
+    assert state.density is not None
     state.density.load_state({"opacity": torch.zeros(count)})
     paint_targets(sequence, state.avatar, torch.zeros(()))
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)

@@ -30,8 +30,7 @@ from mien.training import trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
-from mien.training.parts import TrainingPart
-from mien.training.settings import PRESETS, TrainSettings
+from mien.training.settings import PRESETS, TrainSettings, resolved
 from mien.training.trainer import TrainingData, start, step
 
 COUNT, SIZE = 45_000, (512, 512)
@@ -50,13 +49,13 @@ _PHASES: dict[str, tuple[Any, str]] = {
     "update": (trainer, "_update"),
 }
 """The parts of `trainer.step`, by name: where each function is looked up, and its name there."""
-_OF_PARTS = {
+_OF_WHOLE_HEADS = {
     "before_step": "side views",
     "losses": "side views",
     "after_backward": "after backward",
     "after_update": "after update",
 }
-"""Functions of parts, and their phases."""
+"""Methods of `WholeHead`, and their phases."""
 
 
 @dataclass(frozen=True)
@@ -152,11 +151,10 @@ def step_parts(
     end = time.perf_counter() + seconds
     while not fastest or time.perf_counter() < end:
         watch = Stopwatch()
-        with _watched(watch, state) as watched:
+        with _watched(watch, state):
             whole = watch.phase("other", step)
             for _ in range(ROUND):
-                whole(watched, data, settings)
-        state.step = watched.step
+                whole(state, data, settings)
         if not fastest or sum(watch.seconds.values()) < sum(fastest.values()):
             fastest = watch.seconds
     threads = _native.thread_count()
@@ -176,8 +174,7 @@ def default_case(
     painter, _ = training_case(face_model, len(face_model.faces), *size)
     paint_targets(sequence, painter.avatar, torch.zeros(()))
     state = start([sequence], face_model, preset.config(DEFAULT_METHOD), settings)
-    for part in state.parts:
-        settings = part.settings(settings)
+    settings = resolved(settings, filled=state.head is not None and state.head.fills)
     _grow(state, count)
     state.step = _BEGUN
     order = FrameOrder(training_frames([sequence], settings), seed=0)
@@ -202,21 +199,20 @@ def _grow(state: TrainingState, count: int) -> None:
         drawn[name] = 0.1 * torch.randn(len(trained), *store[name].shape[1:], generator=generator)
     for name, values in drawn.items():
         store.assign_rows(name, trained, values)
+    assert state.density is not None
     state.density.load_state(empty_statistics(len(store)))
 
 
 @contextmanager
-def _watched(watch: Stopwatch, state: TrainingState) -> Iterator[TrainingState]:
-    """The state, all of whose phases and native operations are watched."""
+def _watched(watch: Stopwatch, state: TrainingState) -> Iterator[None]:
+    """Watch all phases of the state's steps, and all native operations."""
     with ExitStack() as stack:
+        for name, phase in _OF_WHOLE_HEADS.items():
+            stack.enter_context(patch.object(state.head, name, watch.phase(phase, getattr(state.head, name))))
         for name, (room, function) in _PHASES.items():
             stack.enter_context(patch.object(room, function, watch.phase(name, getattr(room, function))))
         for name in dir(_native):
             operation = getattr(_native, name)
             if callable(operation) and not isinstance(operation, type) and not name.startswith("_"):
                 stack.enter_context(patch.object(_native, name, watch.operation(name, operation)))
-        yield replace(state, parts=tuple(_watched_part(watch, part) for part in state.parts))
-
-
-def _watched_part(watch: Stopwatch, part: TrainingPart) -> TrainingPart:
-    return replace(part, **{name: watch.phase(phase, getattr(part, name)) for name, phase in _OF_PARTS.items()})
+        yield

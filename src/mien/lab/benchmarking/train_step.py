@@ -23,7 +23,7 @@ from mien.lab.benchmarking.render import thread_counts
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
 from mien.render import rasterize
 from mien.tracking.tracking import Tracking
-from mien.training.ahead import targets_ahead
+from mien.training.batch import targets_ahead
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Sequence, Targets
@@ -105,6 +105,7 @@ def training_case(
     _grow(state.avatar, count)
     order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
+    assert state.density is not None
     state.density.load_state(empty_statistics(count))
     paint_targets(sequence, state.avatar, like)
     return state, TrainingData(order, (Targets(sequence, 0, like=like),))

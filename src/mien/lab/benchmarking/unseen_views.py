@@ -29,6 +29,7 @@ from mien.tracking.neck_cut import NeckParts
 from mien.tracking.scoring import head_crop, head_cutter
 from mien.training.footage.coverage import measure_coverage
 from mien.training.footage.foreground import foreground_colors
+from mien.training.footage.frames import Footage
 from mien.training.footage.sequence import composite
 from mien.training.whole_head.completion import complete_colors, vertex_means
 
@@ -223,7 +224,9 @@ def score_side_views(
 def _completed_colors(experiment: Experiment, threads: int | None) -> Float[Tensor, "v 3"]:
     """Colours of the mesh from the training pictures, completed where they show none."""
     model = experiment.avatar.face_model
-    found = measure_coverage(model, experiment.sequences, experiment.faces, experiment.training_frames, threads)
+    found = measure_coverage(
+        Footage(model, experiment.sequences, experiment.faces, experiment.training_frames), threads
+    )
     neutral = model.head_vertices(experiment.avatar.subject)[0]
     return vertex_means(model, complete_colors(model, neutral, found.seen, found.colors))
 

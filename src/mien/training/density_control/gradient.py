@@ -6,7 +6,7 @@ The loop, with the names of `GradientSettings`:
    normalised device coordinates, counts the views that show the Gaussian, and notes its largest radius on screen and
    its highest opacity.
 2. After `rounds` steps, evenly spread from `start` to `stop`, `adapt` runs a round:
-   - Prune (`_to_prune`): a Gaussian goes if its opacity is below `prune_opacity`. From the first opacity reset after
+   - Prune (`_to_prune`): a Gaussian goes if its opacity is below `PRUNE_OPACITY`. From the first opacity reset after
      `start`, or from `size_start`, it also goes if it is larger than `prune_size`, or than `prune_radius` on screen.
      The method says which opacity counts (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always
      stays. `split_size` and `prune_size` are in `size_unit`: metres, or the extent of the training cameras.
@@ -14,10 +14,10 @@ The loop, with the names of `GradientSettings`:
      `grow_gradient`, strongest first, until there are `max_gaussians`. If such a Gaussian is larger than `split_size`,
      two children from the method's hook `split` replace it. If it is smaller, a copy is added.
    - The statistics start again.
-3. After the steps at `opacity_resets`, opacities above `reset_opacity` are lowered to it, if the method has such a
+3. After the steps at `opacity_resets`, opacities above `RESET_OPACITY` are lowered to it, if the method has such a
    tensor (`opacity_logits`).
 
-Each rule has a switch in `rules` (`DensityRules`).
+`rules_off` switches rules off.
 
 The optimiser's state: Gaussians that stay keep their moments, and copies and children start with zero moments. A reset
 clears the moments of all opacities. The number of updates, which is one count per tensor, goes on.
@@ -34,10 +34,13 @@ from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.avatar.avatar import Posed
 from mien.avatar.density import GradientDensity
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
+
+PRUNE_OPACITY = 0.005  # opacity below which Gaussians are removed. Of 3D Gaussian Splatting
+RESET_OPACITY = 0.01  # highest opacity that remains after a reset. Of 3D Gaussian Splatting
 
 
 class GradientStrategy(DensityStrategy):
@@ -71,7 +74,7 @@ class GradientStrategy(DensityStrategy):
             self._restart(len(store))
         name = self._density.opacity_logits
         if name is not None and progress.completes(max(1, round(time * progress.steps)) for time in self._resets):
-            ceiling = torch.logit(torch.tensor(settings.reset_opacity))
+            ceiling = torch.logit(torch.tensor(RESET_OPACITY))
             logits = store[name].detach()
             lowered = logits.clamp_max(float(ceiling))
             if self._density.may_reset is not None:
@@ -86,9 +89,8 @@ class GradientStrategy(DensityStrategy):
 
     @property
     def _resets(self) -> tuple[float, ...]:
-        """The times at which opacities are lowered, as fractions of the run."""
         settings = self._density.settings
-        return settings.opacity_resets if settings.rules.reset_opacities else ()
+        return () if "reset_opacities" in settings.rules_off else settings.opacity_resets
 
     def state(self) -> dict[str, Tensor]:
         """The statistics since the last round, under the names that checkpoints have always used."""
@@ -112,19 +114,19 @@ class GradientStrategy(DensityStrategy):
         self._highest_opacities = torch.zeros(gaussians, device=self._device)
 
     def _grow_and_prune(self, store: GaussianStore, posed: Posed, progress: Progress, random: torch.Generator) -> None:
-        settings, rules = self._density.settings, self._density.settings.rules
+        settings, off = self._density.settings, self._density.settings.rules_off
         sizes = posed.gaussians.scales.detach().reshape(len(store), 3).amax(-1)
         if settings.size_unit == "extent":
             sizes = sizes / progress.extent
         prune = self._to_prune(store, sizes, progress)
-        if rules.never_empty:
+        if self._density.may_prune is not None and "never_empty" not in off:
             prune = self._density.may_prune(store, prune)
         if bool(prune.all()):
             # Without any Gaussian there are no gradients to grow by, so keep the one that was most visible.
             prune[self._highest_opacities.argmax()] = False
         large = sizes > settings.split_size
-        may_grow = ~prune & torch.where(large, rules.split, rules.clone)
-        grow = self._to_grow(may_grow, settings.max_gaussians - int((~prune).sum()) if rules.cap else len(prune))
+        may_grow = ~prune & torch.where(large, "split" not in off, "clone" not in off)
+        grow = self._to_grow(may_grow, len(prune) if "cap" in off else settings.max_gaussians - int((~prune).sum()))
         split = grow & large
         parents = (grow & ~split).nonzero()[:, 0]
         store.append(parents)
@@ -137,17 +139,19 @@ class GradientStrategy(DensityStrategy):
         store.select(kept)
 
     def _to_prune(self, store: GaussianStore, sizes: Float[Tensor, " n"], progress: Progress) -> Bool[Tensor, " n"]:
-        settings, rules = self._density.settings, self._density.settings.rules
+        settings, off = self._density.settings, self._density.settings.rules_off
         prune = torch.zeros_like(sizes, dtype=torch.bool)
-        if rules.prune_faint:
-            prune = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
+        if "prune_faint" not in off:
+            judged = self._density.judged_opacities
+            seen = self._highest_opacities
+            prune = (seen if judged is None else judged(store, seen)) < PRUNE_OPACITY
         begin = settings.size_start
         if begin is None:
             begin = min((time for time in settings.opacity_resets if time > settings.start), default=math.inf)
         if progress.fraction > begin:
-            if rules.prune_large:
+            if "prune_large" not in off:
                 prune = prune | (sizes > settings.prune_size)
-            if rules.prune_wide and settings.prune_radius > 0:
+            if "prune_wide" not in off and settings.prune_radius > 0:
                 prune = prune | (self._largest_radii > settings.prune_radius)
         return prune
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mien.avatar.avatar import Posed
 from mien.avatar.density import RefillDensity
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
@@ -35,7 +35,9 @@ class RefillStrategy(DensityStrategy):
 
     def observe(self, posed: Posed, rendering: Rendering) -> None:
         """Update each Gaussian's highest opacity."""
-        visible = self._density.observed(posed.gaussians, rendering)
+        observed = self._density.observed
+        visible = posed.gaussians.opacities.detach().reshape(-1)
+        visible = visible if observed is None else observed(posed.gaussians, rendering)
         torch.maximum(self._highest_opacities, visible, out=self._highest_opacities)
 
     def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
@@ -48,8 +50,9 @@ class RefillStrategy(DensityStrategy):
         ]
         if not due:
             return False
-        unseen = self._density.judged_opacities(store, self._highest_opacities) < settings.prune_opacity
-        kept = ~self._density.may_prune(store, unseen)
+        judged, may_prune, seen = self._density.judged_opacities, self._density.may_prune, self._highest_opacities
+        unseen = (seen if judged is None else judged(store, seen)) < settings.prune_opacity
+        kept = ~(unseen if may_prune is None else may_prune(store, unseen))
         if not bool(kept.any()):
             # Without any Gaussian there is no parent for a refill, so keep the one that was most visible.
             kept[self._highest_opacities.argmax()] = True

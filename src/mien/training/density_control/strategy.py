@@ -1,4 +1,4 @@
-"""The interface of density control, and the strategy that never changes anything."""
+"""The interface of density control."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mien.avatar.avatar import Posed
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.render.rendering import Rendering
 
@@ -34,12 +34,7 @@ class DensityStrategy(ABC):
 
     @abstractmethod
     def thin(self, store: GaussianStore, redundant: Redundant) -> None:
-        """Remove redundant Gaussians between two rounds, if the strategy removes any.
-
-        Args:
-            store: The store.
-            redundant: Is called only if its result is used.
-        """
+        """Remove redundant Gaussians between two rounds, if the strategy removes any."""
 
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
@@ -48,24 +43,3 @@ class DensityStrategy(ABC):
     @abstractmethod
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore what `state` returned."""
-
-
-class FixedStrategy(DensityStrategy):
-    """Never changes the store."""
-
-    def observe(self, posed: Posed, rendering: Rendering) -> None:
-        """Do nothing."""
-
-    def adapt(self, store: GaussianStore, posed: Posed, progress: Progress, random: Random) -> bool:
-        """Return False, because the store never changes."""
-        return False
-
-    def thin(self, store: GaussianStore, redundant: Redundant) -> None:
-        """Do nothing."""
-
-    def state(self) -> dict[str, Tensor]:
-        """An empty dict."""
-        return {}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        """Do nothing."""

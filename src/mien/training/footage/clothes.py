@@ -23,12 +23,7 @@ def packed_clothes(masks: Bool[np.ndarray, "t h w"]) -> dict[str, UInt8[np.ndarr
 
 
 def read_clothes(folder: Path, shape: tuple[int, int, int]) -> UInt8[np.ndarray, "t h p"] | None:
-    """Return the packed masks of clothes of a sequence, or None if its dataset has none.
-
-    Args:
-        folder: The sequence's folder.
-        shape: Number of timesteps, height and width of its pictures.
-    """
+    """Return the packed masks of clothes of a sequence, or None if its dataset has none."""
     file = folder / FOREIGN
     if not file.exists():
         return None

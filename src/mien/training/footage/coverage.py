@@ -4,7 +4,6 @@ One camera in front sees half of a head. `Coverage` belongs to the data and not 
 covered, what is not covered is filled afterwards, and pictures of the avatar can say which sides were filmed.
 """
 
-from collections.abc import Sequence as Items
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +13,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from mien.face.model import FaceModel
-from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
-from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.mesh_colors import DEPTH_TOLERANCE, sample_picture
-from mien.training.footage.sequence import Sequence
 
 _COVERAGE_EVEN_FRAMES = 48  # number of evenly spread frames in which coverage is measured
 _COVERAGE_TURNED_FRAMES = 24  # number of other frames: those in which the head turns furthest to each side
@@ -49,38 +46,22 @@ class Coverage:
 
 
 @torch.no_grad()
-def measure_coverage(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    threads: int | None = None,
-) -> Coverage:
-    """Confidence and mean colour of every triangle.
+def measure_coverage(footage: Footage, threads: int | None = None) -> Coverage:
+    """Confidence and mean colour of every triangle. The number of threads changes no bit.
 
     A frame counts for a triangle by the squared cosine between the triangle's normal and the direction to the camera,
     where the mesh hides it from nothing (a soft test against the mesh's own depth) and where the scoring mask has the
     head. At most 72 frames are used, and those in which the head turns furthest to either side are among them.
-
-    Args:
-        face_model: The face model, float32 on the CPU.
-        sequences: The sequences that the frames count in.
-        faces: Face parameters of each sequence, with all its timesteps.
-        frames: The frames to look at.
-        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
     """
-    count = len(face_model.faces)
+    count = len(footage.face_model.faces)
     colors, weights, above = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
-    even, turned = _COVERAGE_EVEN_FRAMES, _COVERAGE_TURNED_FRAMES
-    chosen = representative_frames(faces, sequences, frames, even, turned)
-
-    neck = NeckParts.of(face_model)
+    chosen = representative_frames(footage, _COVERAGE_EVEN_FRAMES, _COVERAGE_TURNED_FRAMES)
+    neck = NeckParts.of(footage.face_model)
 
     def seen_in(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        face = faces[frame.sequence][frame.timestep]
-        vertices = face_model(face)[0]
-        cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
-        return _seen_colors(sequences[frame.sequence], frame, vertices, face_model.faces, cut)
+        vertices = footage.vertices(frame)
+        cut = fit_neck_cut(neck, vertices, footage.face(frame).T_world_head[0, :3, 1])
+        return _seen_colors(footage, frame, vertices, cut)
 
     for own, weight, line in stream_in_threads(seen_in, chosen, threads):
         colors += weight[:, None] * own
@@ -92,24 +73,13 @@ def measure_coverage(
     return Coverage(seen, colors, smoothstep(2 * above / len(chosen) - 1))
 
 
-def representative_frames(
-    faces: Items[FaceParams],
-    sequences: Items[Sequence],
-    frames: Items[Frame],
-    even: int,
-    turned: int,
-) -> list[Frame]:
+def representative_frames(footage: Footage, even: int, turned: int) -> list[Frame]:
     """Evenly spread frames, and those in which the camera sees the head furthest from each side, above and below.
 
-    Args:
-        faces: Face parameters of each sequence, with all its timesteps.
-        sequences: The sequences that the frames count in.
-        frames: The frames to choose from.
-        even: Number of evenly spread frames.
-        turned: Number of the others, a quarter for each direction.
+    `turned` is the number of the latter, a quarter for each direction.
     """
-    chosen = spread_frames(frames, even)
-    directions = torch.stack([_camera_direction(faces, sequences, frame) for frame in frames])
+    frames, chosen = footage.frames, spread_frames(footage.frames, even)
+    directions = torch.stack([_camera_direction(footage, frame) for frame in frames])
     share = turned // 4
     for axis in (0, 1):
         order = directions[:, axis].argsort(stable=True).tolist()
@@ -129,12 +99,11 @@ def smoothstep(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     return inside * inside * (3 - 2 * inside)
 
 
-def _camera_direction(faces: Items[FaceParams], sequences: Items[Sequence], frame: Frame) -> Float[Tensor, " 3"]:
+def _camera_direction(footage: Footage, frame: Frame) -> Float[Tensor, " 3"]:
     """The unit direction from the head to the frame's camera, in the head's axes."""
-    face = faces[frame.sequence]
+    face = footage.faces[frame.sequence]
     rotation, place = face.head_rotation[frame.timestep], face.head_translation[frame.timestep]
-    to_camera = sequences[frame.sequence].tracking.cameras[frame.camera].position - place
-    return normalize(matrix_from_axis_angle(rotation).T @ to_camera, dim=0)
+    return normalize(matrix_from_axis_angle(rotation).T @ (footage.camera(frame).position - place), dim=0)
 
 
 def triangle_views(
@@ -147,18 +116,18 @@ def triangle_views(
 
 
 def _seen_colors(
-    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], cut: NeckCut
+    footage: Footage, frame: Frame, vertices: Float[Tensor, "v 3"], cut: NeckCut
 ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, " f"], Float[Tensor, " f"]]:
     """Each triangle's colour in one picture, its weight, and whether it is above the cut at the neck (0..1).
 
     The weight is 0 if the triangle is hidden, faces away, or is not part of the head that is scored.
     """
-    camera = sequence.tracking.cameras[frame.camera]
+    sequence, camera, faces = footage.sequences[frame.sequence], footage.camera(frame), footage.face_model.faces
     centers = vertices[faces.long()].mean(1)
     pixels, depth = camera.project(centers)
     grid = pixels / torch.tensor([camera.width, camera.height]) * 2 - 1
     picture = torch.from_numpy(np.array(sequence.capture.images[frame[1:]])).float() / 255
-    mask = torch.from_numpy(np.array(sequence.scoring[frame[1:]])).float()[..., None] / 255
+    mask = torch.from_numpy(footage.scoring(frame)).float()[..., None] / 255
     nearest = rasterize_mesh(vertices, faces, camera).depth[..., None].nan_to_num(posinf=1e3)
     colors, head = (sample_picture(whole, grid, "bilinear") for whole in (picture, mask))
     front = sample_picture(nearest, grid, "nearest")[:, 0]

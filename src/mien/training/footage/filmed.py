@@ -68,13 +68,7 @@ def filmed_share(vertices: Float[Tensor, "v 3"], face_model: FaceModel, coverage
 
 
 def filmed_yaws(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage: Coverage) -> tuple[int, int] | None:
-    """How far views to the person's right and left show what was filmed, in whole degrees; None if none do.
-
-    Args:
-        face_model: The face model.
-        vertices: The person's neutral head in the head frame (`FaceModel.head_vertices`), in metres.
-        coverage: What the training pictures show.
-    """
+    """How far views to the person's right and left show what was filmed, in whole degrees; None if none do."""
 
     def is_filmed(yaw: int) -> bool:
         return filmed_share(vertices, face_model, coverage, view_of_head(vertices, yaw)) >= _FILMED_CONFIDENCE

@@ -22,10 +22,6 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
     """Return the picture with estimated colours of the person where the matte is soft, and 0 where it is empty.
 
     Solid pixels keep their colours. Windows are added up exactly, so all processors give the same bytes.
-
-    Args:
-        image: The filmed picture, sRGB.
-        matte: Opacity of the person in it, not cut at the neck.
     """
     result = np.zeros_like(image)
     cv2.copyTo(image, (matte > 0).view(np.uint8), result)

@@ -4,19 +4,24 @@ Every random draw depends only on the seed and the step, so that runs resume exa
 """
 
 import hashlib
+from collections.abc import Callable
 from collections.abc import Sequence as Items
-from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from mien.camera import Camera
 from mien.errors import UserError
-from mien.training.footage.sequence import Sequence
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.training.footage.sequence import Sequence, Target
 from mien.training.settings import Split, TrainSettings, check_held_out
-from mien.training.splits.own import OWN_SPLIT, read_own_split
+from mien.training.settings.splits import SPLITS
 
 _EXTENT_MARGIN = 1.1
 """Factor on the largest distance of a camera from the mean of all. Of 3D Gaussian Splatting's published code."""
@@ -32,10 +37,8 @@ _RARITY_LIMIT = 2.0  # largest factor by which rare frames are drawn more often,
 _RARITY_MOST_NEIGHBORS = 100  # largest number of neighbours in which a frame's rarity is measured
 
 Item = TypeVar("Item")
-_ORDER, _BACKGROUND, _DENSITY, _CROP, _COVER, _ASIDE = range(6)
-"""Purposes of random numbers."""
-_BLOCK, _EVERY = 10, 5
-_TAIL_SHARE = 0.2
+ORDER, BACKGROUND, DENSITY, CROP, COVER, SIDE_VIEW = range(6)
+"""Purposes of random numbers: frames, backgrounds, density control, crops of the perceptual loss, hidden Gaussians."""
 
 
 class Frame(NamedTuple):
@@ -46,36 +49,65 @@ class Frame(NamedTuple):
     camera: int
 
 
-def held_out(timesteps: int, split: Split) -> Bool[Tensor, " t"]:
-    """Which of a sequence's timesteps are held out for testing.
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """The frames that a run trains on, on the CPU in float32."""
 
-    - `blocks`: every fifth block of 10, starting with the fifth, so that test poses and expressions resemble those of
-      training. Clips of fewer than 50 timesteps have shorter blocks, so that they have a fifth one.
-    - `tail`: the last 20 %, which may show things that were never seen.
-    - `none`, `gaussian-avatars`, `nersemble-benchmark` and `dataset`: nothing. The latter three hold out what is listed
-      elsewhere.
-    """
-    index = torch.arange(timesteps)
-    if split == "blocks":
-        block = min(_BLOCK, max(1, timesteps // _EVERY))
-        return index // block % _EVERY == _EVERY - 1
-    if split == "tail":
-        return index >= timesteps - round(_TAIL_SHARE * timesteps)
-    return torch.zeros(timesteps, dtype=torch.bool)
+    face_model: FaceModel
+    sequences: Items[Sequence]
+    faces: Items[FaceParams]
+    """Face parameters of each sequence, with all its timesteps."""
+    frames: Items[Frame]
+
+    def face(self, frame: Frame) -> FaceParams:
+        """The face in a frame."""
+        return self.faces[frame.sequence][frame.timestep]
+
+    def vertices(self, frame: Frame) -> Float[Tensor, "v 3"]:
+        """The posed mesh in a frame, in world space, in metres."""
+        return self.face_model(self.face(frame))[0]
+
+    def camera(self, frame: Frame) -> Camera:
+        """The camera of a frame."""
+        return self.sequences[frame.sequence].tracking.cameras[frame.camera]
+
+    def matte(self, frame: Frame) -> UInt8[np.ndarray, "h w"]:
+        """Opacity of the person, not cut at the neck."""
+        return np.asarray(self.sequences[frame.sequence].capture.mattes[frame[1:]])
+
+    def scoring(self, frame: Frame) -> UInt8[np.ndarray, "h w"]:
+        """Opacity of the pixels that count."""
+        return np.array(self.sequences[frame.sequence].scoring[frame[1:]])
+
+
+@dataclass(frozen=True, eq=False)
+class BatchFrame:
+    """One frame of a step."""
+
+    number: int
+    """Number of frames that the run used before it."""
+    frame: Frame
+    index: int
+    """Its timestep in the track."""
+    face: FaceParams
+    camera: Camera
+    """Its camera, at the size of the target."""
+    target: Target
+    goal: Callable[[], Any] | None
+    """Makes the goal of the perceptual loss. None if the frame is compared without that loss."""
+
+
+def held_out(timesteps: int, split: Split, folder: Path | None = None) -> Bool[Tensor, " t"]:
+    """Which timesteps of a sequence are held out for testing. A folder is needed for the split of its dataset."""
+    mask = torch.zeros(timesteps, dtype=torch.bool)
+    for start, stop in SPLITS[split].timesteps(timesteps, folder):
+        mask[start:stop] = True
+    return mask
 
 
 def held_out_of(sequence: Sequence, split: Split) -> Bool[Tensor, " t"]:
-    """Which timesteps of a sequence are held out: by `held_out`, or by the dataset that the sequence comes from."""
-    timesteps = sequence.capture.timesteps
-    if split != OWN_SPLIT:
-        return held_out(timesteps, split)
-    own = read_own_split(sequence.folder)
-    if own is None:
-        raise UserError(f"--split {OWN_SPLIT}: the sequence {sequence.name} has no split; choose another --split")
-    mask = torch.zeros(timesteps, dtype=torch.bool)
-    for start, stop in own.timesteps:
-        mask[start:stop] = True
-    return mask
+    """Which timesteps of a sequence are held out."""
+    return held_out(sequence.capture.timesteps, split, sequence.folder)
 
 
 def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list[Frame]:
@@ -86,13 +118,10 @@ def training_frames(sequences: Items[Sequence], settings: TrainSettings) -> list
     """
     names = [sequence.name for sequence in sequences]
     check_held_out(names, settings)
-    held_out_names, held_out_ids = settings.held_out_sequences, settings.held_out_cameras
-    if (settings.split == "gaussian-avatars" and not (held_out_names and held_out_ids)) or (
-        settings.split == "nersemble-benchmark" and not (held_out_names or held_out_ids)
-    ):
+    if SPLITS[settings.split].of_cameras and not (settings.held_out_sequences or settings.held_out_cameras):
         raise UserError(
-            f"--split {settings.split}: the sequence and the camera to hold out are not filled in; train with `mien "
-            "train`, or give the result of mien.training.with_named_split or with_benchmark_split"
+            f"--split {settings.split}: what it holds out is not filled in; train with `mien train`, or give the "
+            "result of mien.training.settings.splits.fill_in"
         )
     ids = dict.fromkeys(camera_id for sequence in sequences for camera_id in sequence.capture.camera_ids)
     unknown = [camera_id for camera_id in settings.held_out_cameras if camera_id not in ids]
@@ -163,11 +192,8 @@ def expression_rarity(sequences: Items[Sequence], frames: Items[Frame]) -> Float
 class FrameOrder:
     """Shuffled passes over the training frames.
 
-    Args:
-        frames: The frames. A pass has as many steps.
-        seed: Seed of the shuffling.
-        weights: How often each frame is drawn, relative to the others. A pass has every frame as often as its share
-            says, rounded down or up at random. None draws every frame once.
+    `weights` say how often each frame is drawn, relative to the others: a pass has every frame as often as its share
+    says, rounded down or up at random. None draws every frame once.
     """
 
     def __init__(self, frames: Items[Frame], seed: int, weights: Float[Tensor, " n"] | None = None):
@@ -181,7 +207,7 @@ class FrameOrder:
         """The frame of a step and the number of passes completed before it."""
         epoch = step // len(self._frames)
         if epoch != self._epoch:
-            generator = random_at(self._seed, _ORDER, epoch)
+            generator = random_at(self._seed, ORDER, epoch)
             order = torch.randperm(len(self._frames), generator=generator)
             if self._ends is not None:
                 # One random shift for evenly spaced points: each frame owns an interval as long as its share.
@@ -194,41 +220,14 @@ class FrameOrder:
         return self._frames[self._order[step % len(self._frames)]], epoch
 
 
-def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
-    """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
-    if settings.background == "auto":
-        settings = replace(settings, background="mixed" if filled else "white")
-    return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
-
-
 def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
     """The background colour of a step, 0 to 255."""
-    generator = random_at(settings.seed, _BACKGROUND, step)
+    generator = random_at(settings.seed, BACKGROUND, step)
     color = torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
     drawn = settings.background == "random" or (
         settings.background == "mixed" and float(torch.rand((), generator=generator)) < _MIXED_SHARE
     )
     return color if drawn else np.full(3, 255, dtype=np.uint8)
-
-
-def density_random(settings: TrainSettings, step: int) -> torch.Generator:
-    """The random numbers for a step's density control."""
-    return random_at(settings.seed, _DENSITY, step)
-
-
-def crop_random(settings: TrainSettings, step: int) -> torch.Generator:
-    """The random numbers for a step's crop of the perceptual loss."""
-    return random_at(settings.seed, _CROP, step)
-
-
-def cover_random(settings: TrainSettings, step: int) -> torch.Generator:
-    """The random numbers for the colour of a step's hidden Gaussians."""
-    return random_at(settings.seed, _COVER, step)
-
-
-def side_random(settings: TrainSettings, step: int) -> torch.Generator:
-    """The random numbers for a step's side view."""
-    return random_at(settings.seed, _ASIDE, step)
 
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:

@@ -33,12 +33,7 @@ def hidden_triangles(
 
     A triangle counts as seen if one of seven points of it is nearer than everything outside, in its own pixel or in one
     beside it.
-
-    Args:
-        vertices: Vertices of the face model in world space, in metres.
-        face_model: The face model, on the CPU.
-        inside: The triangles inside the head. Others are never returned.
-        camera: The camera that sees them.
+    Vertices are in world space, in metres. Triangles that are not `inside` the head are never returned.
     """
     scale = _HIDDEN_SIZE / max(camera.width, camera.height)
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))

@@ -138,15 +138,10 @@ class Targets:
     """The pictures of one sequence at training resolution, composited.
 
     Pictures over a fixed background are cached, and of cleaned pictures over changing ones the soft pixels.
-
-    Args:
-        sequence: The sequence.
-        resolution: Longer side in pixels, or 0 for the capture's own.
-        share: Number of sequences that share the memory for cached pictures.
-        like: Cameras and targets have its float dtype and its device.
-        face_model: The face model, on the CPU, if targets shall have the boxes around eyes and mouth.
-        inside: The triangles inside the head, if targets shall say which of them are hidden. Needs `face_model`.
-        cleaned: Whether soft edges have the colours of the person alone (`foreground_colors`).
+    `resolution` is the longer side in pixels, or 0 for the capture's own. `share` sequences share the memory of the
+    cache. Cameras and targets have dtype and device of `like`. With a face model, targets have the boxes around eyes
+    and mouth; with the triangles `inside` a head, they say which of these are hidden. `cleaned` soft edges have the
+    colours of the person alone.
     """
 
     def __init__(
@@ -263,12 +258,7 @@ class Targets:
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """The sequence in FOLDER/{capture,tracking,scoring}. Its name is that of the folder.
-
-    Raises:
-        UserError: a part is missing, damaged, of another version, is being written, or does not belong to the other
-            parts.
-    """
+    """The sequence in FOLDER/{capture,tracking,scoring}. Its name is that of the folder."""
     parts = [folder / name for name in ("capture", "tracking", "scoring")]
     return read_beside_writers(lambda: _read_parts(folder), parts, [folder])
 

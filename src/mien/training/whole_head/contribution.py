@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
+from mien.avatar.bound_surface import BoundSurface
 from mien.camera import Camera
 from mien.face.params import FaceParams
 from mien.gaussians import SH_C0
@@ -29,11 +30,7 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
     """The most that each Gaussian adds to one of the views: the sum of its weights in the blending, in pixels.
 
     The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it (3D Gaussian Splatting,
-    equation 3). It is the derivative of the picture by the Gaussian's colour.
-
-    Args:
-        avatar: The avatar.
-        views: A face at one timestep, and a camera, for each view.
+    equation 3). It is the derivative of the picture by the Gaussian's colour. A view is one timestep and a camera.
     """
     most = torch.zeros(len(avatar.gaussian_store()), device=avatar.face_model.template.device)
     for face, camera in views:
@@ -48,22 +45,15 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
 
 
 def prune_hidden(
-    avatar: Avatar, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool
+    avatar: Avatar, surface: BoundSurface, unseen: Unseen, views: Items[tuple[FaceParams, Camera]], *, close: bool
 ) -> Bool[Tensor, " n"]:
     """Deal with Gaussians that hardly add to any view, and return which are to be removed.
 
     One Gaussian stays on each triangle. If it is hidden, it gets the completed colour and, with `close`, also place,
-    shape and opacity of a fill. Made-up sides and the inside of the mouth are left alone.
-
-    Args:
-        avatar: An avatar with bound Gaussians.
-        unseen: What the training pictures do not show of the head.
-        views: Views of the training, as for `contributions`.
-        close: Whether what stays becomes a surface, which training then fits to the pictures.
+    shape and opacity of a fill, which training then fits to the pictures. Filled sides and the inside of the mouth
+    are left alone.
     """
-    surface, prior = avatar.surface(), unseen.prior
-    assert surface is not None
-    triangles = surface.triangles()
+    prior, triangles = unseen.prior, surface.triangles()
     kept = prior.filled_in if prior.closed is None else prior.closed
     assert kept is not None
     hidden = (contributions(avatar, views) < _HIDDEN_CONTRIBUTION) & ~kept[triangles]

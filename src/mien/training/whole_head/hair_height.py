@@ -1,22 +1,27 @@
-"""How far hair stands out from the scalp of a face model, measured on the outlines of the mattes."""
+"""How far hair stands out from a face model, measured on the outlines of the mattes, and long hair behind a head.
 
-from collections.abc import Sequence as Items
+The front camera sees hair beside jaw and neck, as far as it stands out from the outline, and nothing of the back. A
+head whose hair ended at the hairline of the nape would lack much of its outline from the side. Long hair falls from
+where the head is widest, so behind the ears it is as far from the upright axis as it is above, down to the level to
+which it hangs at the sides.
+"""
+
+import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from mien.face.head_parts import head_parts
 from mien.face.mirror import triangle_geometry
 from mien.face.model import FaceModel
-from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh
-from mien.training.footage.frames import Frame, spread_frames
-from mien.training.footage.sequence import Sequence
-from mien.training.whole_head.spreading import Surface
+from mien.tracking.neck_cut import NeckParts, fit_neck_cut
+from mien.training.footage.frames import Footage, Frame, spread_frames
+from mien.training.whole_head.completion import Surface
 
 _HAIR_FRAMES = 60  # number of evenly spread frames whose outlines are measured
 _HAIR_STEP = 0.002  # distance between the points that are tested above the scalp, in metres
@@ -46,33 +51,20 @@ _HANGING_HAIR_ROUNDS = 4  # rings of triangles around an outline that hanging ha
 
 
 @torch.no_grad()
-def hair_height(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    threads: int | None = None,
-) -> Float[Tensor, " f"]:
+def hair_height(footage: Footage) -> Float[Tensor, " f"]:
     """Return the height of hair above each triangle along its normal, in metres, 0..0.08; 0 outside of the scalp.
 
     A triangle of the scalp is measured in frames in which it is on the outline of the mesh: its height is the distance
     along its normal to the border of the matte. Triangles that are never on the outline have the height of what was
     measured where the head is as steep. Near skin, ears included, they have no more than hair that rises slowly from
     the hairline, where the height fades. Without any measurement it is 0.
-
-    Args:
-        face_model: The face model, float32 on the CPU.
-        sequences: The sequences that the frames count in.
-        faces: Face parameters of each sequence, with all its timesteps.
-        frames: The frames to look at. At most 60 of them, evenly spread, are used.
-        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
     """
-    parts = head_parts(face_model)
+    face_model, parts = footage.face_model, head_parts(footage.face_model)
     scalp = parts.scalp
-    height, known = _outline_heights(face_model, sequences, faces, frames, scalp, threads)
+    height, known = _outline_heights(footage, scalp)
     if not bool(known.any()):
         return height[:, 0]
-    vertices = face_model.rest_vertices(faces[0])
+    vertices = face_model.rest_vertices(footage.faces[0])
     surface, upward = Surface.of(vertices, face_model.faces), triangle_geometry(vertices, face_model.faces)[2][:, 1]
     most = _HAIR_GUESS_LIMIT * _on_top(surface, height, known)
     guess = _by_slope(surface, upward, height, known, scalp).clamp_max(most)
@@ -88,47 +80,29 @@ def hair_height(
 
 
 @torch.no_grad()
-def hanging_hair(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    threads: int | None = None,
-) -> Float[Tensor, " f"]:
+def hanging_hair(footage: Footage) -> Float[Tensor, " f"]:
     """Return how far the outline stands out beside skin and neck, in metres, 0..0.08; 0 on the scalp.
 
     Long hair hangs off the scalp, beside cheeks and neck, and rings hang from ears. Unlike `hair_height`, nothing is
-    concluded about triangles that are far from any outline. The arguments are those of `hair_height`.
+    concluded about triangles that are far from any outline.
     """
-    parts = head_parts(face_model)
+    face_model, parts = footage.face_model, head_parts(footage.face_model)
     beside = parts.skin | parts.neck
-    height, known = _outline_heights(face_model, sequences, faces, frames, beside, threads)
+    height, known = _outline_heights(footage, beside)
     if not bool(known.any()):
         return height[:, 0]
-    surface = Surface.of(face_model.rest_vertices(faces[0]), face_model.faces)
+    surface = Surface.of(face_model.rest_vertices(footage.faces[0]), face_model.faces)
     for _ in range(_HANGING_HAIR_ROUNDS):
         height = torch.maximum(height, surface.around(height, torch.ones_like(known)))
         height[~beside] = 0
     return height[:, 0].clamp(0, HAIR_HIGHEST)
 
 
-def _outline_heights(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    region: Bool[Tensor, " f"],
-    threads: int | None,
-) -> tuple[Float[Tensor, "f 1"], Float[Tensor, " f"]]:
+def _outline_heights(footage: Footage, region: Bool[Tensor, " f"]) -> tuple[Float[Tensor, "f 1"], Float[Tensor, " f"]]:
     """Return the height of the outline above the triangles of a region, and how sure it is, 0..1; 0 elsewhere."""
-    chosen = region.nonzero()[:, 0]
-
-    def measured_in(frame: Frame) -> Tensor:
-        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
-        return _measured(sequences[frame.sequence], frame, vertices, face_model.faces, chosen)
-
-    used = spread_frames(frames, _HAIR_FRAMES)
-    heights = torch.stack(list(stream_in_threads(measured_in, used, threads))) if used else torch.zeros(0, len(chosen))
+    chosen, used = region.nonzero()[:, 0], spread_frames(footage.frames, _HAIR_FRAMES)
+    measured = list(stream_in_threads(lambda frame: _measured(footage, frame, chosen), used))
+    heights = torch.stack(measured) if used else torch.zeros(0, len(chosen))
     height, known = torch.zeros(len(region), 1), torch.zeros(len(region))
     found = heights.isfinite().any(0)
     if bool(found.any()):
@@ -174,12 +148,10 @@ def _behind_hairline(surface: Surface, scalp: Bool[Tensor, " f"], skin: Bool[Ten
     return _HAIRLINE_HEIGHT + _HAIRLINE_RISE * apart.amin(1)
 
 
-def _measured(
-    sequence: Sequence, frame: Frame, vertices: Float[Tensor, "v 3"], faces: Tensor, chosen: Tensor
-) -> Float[Tensor, " n"]:
+def _measured(footage: Footage, frame: Frame, chosen: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Return the height of the matte's border above some triangles in one frame; NaN where the frame does not tell."""
-    camera = sequence.tracking.cameras[frame.camera]
-    matte = torch.from_numpy(sequence.capture.mattes[frame[1:]].astype(np.float32)) / 255
+    vertices, faces, camera = footage.vertices(frame), footage.face_model.faces, footage.camera(frame)
+    matte = torch.from_numpy(footage.matte(frame).astype(np.float32)) / 255
     empty = rasterize_mesh(vertices, faces, camera).face_index < 0
     middles, _, normals = (values[chosen] for values in triangle_geometry(vertices, faces))
     cosine = (normals * normalize(camera.position - middles, dim=-1)).sum(-1)
@@ -199,5 +171,113 @@ def _measured(
 
 
 def _sample(picture: Float[Tensor, "h w"], grid: Float[Tensor, "n s 2"]) -> Float[Tensor, "n s"]:
-    """Return values of a picture at points in -1..1; 0 outside."""
     return grid_sample(picture[None, None], grid.nan_to_num(2.0).clamp(-2, 2)[None], align_corners=False)[0, 0]
+
+
+_BACK_HAIR_LEAST_HEIGHT = 0.015
+"""Median height at a level of jaw and neck, in metres, from which hair counts as hanging. Measured: 41 to 70 mm on two
+drawn people with long hair, and 15 mm at most on those with short hair."""
+_BACK_HAIR_LEAST_DISTANCE = 0.8
+"""Least distance from the axis at the sides, as a share of that of the hair above, at which hair hangs."""
+_BACK_HAIR_LEVEL = 0.01  # height of the levels at which the sides are looked at, in metres
+_BACK_HAIR_BESIDE = 35.0
+"""Angle from the sides, in degrees, within which the pictures' outline tells how far hair hangs."""
+_BACK_HAIR_ALIKE = 15.0
+"""Difference of angle about the axis, in degrees, within which hair above decides about hair below."""
+_BACK_HAIR_MOST_FORWARD = 0.0
+"""Forward part of a triangle's normal up to which it is behind. Geometry: hair in front of the shoulders is not made
+up."""
+_BACK_HAIR_CUT_CLEARANCE = 0.006  # least distance of hair from the cut at the neck, in metres
+
+
+@torch.no_grad()
+def back_hair(
+    face_model: FaceModel,
+    vertices: Float[Tensor, "v 3"],
+    hair: Float[Tensor, " f"],
+    hanging: Float[Tensor, " f"],
+) -> Float[Tensor, " f"]:
+    """Return the height of hair that hangs behind the head, along the triangles' normals, in metres, 0..0.08.
+
+    It is 0 on triangles that face forward, where hair does not hang to their level, and everywhere on short hair. The
+    vertices are those of the neutral head in the head frame (y up, z ahead), in metres, on the CPU. `hair` and
+    `hanging` are from `hair_height` and `hanging_hair`.
+    """
+    middles, _, normals = triangle_geometry(vertices.detach().float(), face_model.faces.cpu())
+    parts, behind_head = head_parts(face_model), torch.zeros_like(hair)
+    if not bool(parts.scalp.any()) or not bool((hair > 0).any()):
+        return behind_head
+    scalp = middles[parts.scalp][:, [0, 2]]
+    axis = (scalp.amin(0) + scalp.amax(0)) / 2
+    flat, outwards = middles[:, [0, 2]] - axis, normals[:, [0, 2]]
+    angle = torch.atan2(flat[:, 0], flat[:, 1])  # 0 in front, +-90 degrees at the sides
+    above = flat + hair[:, None] * outwards
+    widest = _widest_above(angle, middles[:, 1], above.norm(dim=1), parts.scalp)
+    share = (flat + hanging[:, None] * outwards).norm(dim=1) / widest.clamp_min(1e-6)
+    beside = (angle.abs() - math.pi / 2).abs() < math.radians(_BACK_HAIR_BESIDE)
+    lowest = _lowest_level(beside, angle > 0, middles[:, 1], share, hanging, parts.scalp)
+    if lowest is None:
+        return behind_head
+    behind = (parts.scalp | parts.neck | parts.skin) & (angle.abs() > math.pi / 2)
+    behind &= normals[:, 2] < _BACK_HAIR_MOST_FORWARD
+    behind &= middles[:, 1] >= lowest
+    # The distance t along the normal to the wall of hair solves |flat + t outwards| = widest.
+    a = outwards.square().sum(1).clamp_min(1e-3)
+    b, c = (flat * outwards).sum(1), flat.square().sum(1) - widest.square()
+    distance = (-b + (b * b - a * c).clamp_min(0).sqrt()) / a
+    useful = behind & (distance > hair) & (a > 0.25)
+    distance = torch.where(useful, distance, behind_head).clamp(0, HAIR_HIGHEST)
+    return distance * _above_cut(face_model, vertices, middles, distance[:, None] * normals)
+
+
+def _widest_above(
+    angle: Float[Tensor, " f"], level: Float[Tensor, " f"], radius: Float[Tensor, " f"], scalp: Bool[Tensor, " f"]
+) -> Float[Tensor, " f"]:
+    """Return how far hair is from the axis at most, above each triangle and in its direction; 0 if there is none."""
+    sources = scalp.nonzero()[:, 0]
+    turned = (angle[:, None] - angle[sources]).abs()
+    alike = torch.minimum(turned, 2 * math.pi - turned) < math.radians(_BACK_HAIR_ALIKE)
+    alike &= level[sources] >= level[:, None]
+    return torch.where(alike, radius[sources], 0.0).amax(1)
+
+
+def _lowest_level(
+    beside: Bool[Tensor, " f"],
+    left: Bool[Tensor, " f"],
+    level: Float[Tensor, " f"],
+    share: Float[Tensor, " f"],
+    hanging: Float[Tensor, " f"],
+    scalp: Bool[Tensor, " f"],
+) -> float | None:
+    """Return the lowest level to which hair hangs without a gap at both sides; None if it does not hang at all."""
+    around, lowest = beside & scalp, []
+    if not bool(around.any()):
+        return None
+    top, step = float(level[around].amin()), _BACK_HAIR_LEVEL
+    for side in (left, ~left):
+        bottom = top
+        while True:
+            own = beside & side & ~scalp & (level < bottom) & (level >= bottom - step) & (hanging > 0)
+            if not (
+                bool(own.any())
+                and float(hanging[own].median()) > _BACK_HAIR_LEAST_HEIGHT
+                and float(share[own].median()) > _BACK_HAIR_LEAST_DISTANCE
+            ):
+                break
+            bottom -= step
+        lowest.append(bottom)
+    return max(lowest) if max(lowest) < top - step / 2 else None
+
+
+def _above_cut(
+    face_model: FaceModel,
+    vertices: Float[Tensor, "v 3"],
+    middles: Float[Tensor, "f 3"],
+    offsets: Float[Tensor, "f 3"],
+) -> Float[Tensor, " f"]:
+    """Return the largest share of each offset, 0..1, with which a point stays above the cut at the neck."""
+    cut = fit_neck_cut(NeckParts.of(face_model), vertices, vertices.new_tensor([0.0, 1.0, 0.0]))
+    share = torch.zeros(len(middles))
+    for part in torch.linspace(0, 1, 9).tolist():
+        share = torch.where(cut.margins(middles + part * offsets) > _BACK_HAIR_CUT_CLEARANCE, part, share)
+    return share

@@ -53,12 +53,7 @@ class HairSurface:
     the last correction, [k] each; `count`, the number of corrections."""
 
     def collect(self, surface: BoundSurface, fraction: float) -> None:
-        """Add the gradients of a step, after its backward pass, unless no correction follows.
-
-        Args:
-            surface: The surface of the avatar.
-            fraction: How far the run was before the step, 0..1.
-        """
+        """Add the gradients of a step, after its backward pass, unless no correction follows the time `fraction`."""
         gradient = surface.height_gradient() if fraction < _HAIR_END else None
         if gradient is not None:
             self.state["gradient"] += gradient[self.scalp].to(self.kernel) * self.shown
@@ -66,10 +61,7 @@ class HairSurface:
     def correct(self, surface: BoundSurface, fraction: float, rate: float) -> bool:
         """Move the avatar's Gaussians along the normals if it is time for that. Return whether they moved.
 
-        Args:
-            surface: The surface of the avatar.
-            fraction: How far the run is, 0..1.
-            rate: Size of a first correction in metres, where all gradients agree.
+        `rate` is the size of a first correction in metres, where all gradients agree.
         """
         begin, end, furthest = _HAIR_BEGIN, _HAIR_END, _HAIR_FURTHEST_SHIFT
         moves = rate > 0 and begin <= fraction < end
@@ -113,9 +105,7 @@ class HairSurface:
 def hair_surface(avatar: Avatar, prior: SurfacePrior) -> HairSurface | None:
     """The surface of the hair at the start of a run. None if the face model has no scalp.
 
-    Args:
-        avatar: An avatar with bound Gaussians, on any device.
-        prior: What is known of its surface, on the same device.
+    The avatar and what is known of its surface are on the same device.
     """
     vertices = avatar.face_model.head_vertices(avatar.subject)[0].detach()
     scalp = head_parts(avatar.face_model).scalp.nonzero()[:, 0]

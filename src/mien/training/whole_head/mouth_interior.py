@@ -4,7 +4,7 @@ Triangles inside a mouth are a centimetre wide, and their Gaussians may lie that
 they come out through the skin, paint cheeks and closed lids, and are missing where the mouth opens.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,13 +13,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien.avatar.avatar import Avatar, Posed
-from mien.avatar.bound_surface import FILL_OPACITY, BoundSurface
+from mien.avatar.bound_surface import BoundSurface
 from mien.face.head_parts import head_parts
+from mien.face.model import FaceModel
 from mien.gaussians import sh_from_rgb
 from mien.training.footage.coverage import Coverage
-from mien.training.footage.frames import cover_random
-from mien.training.footage.hidden import inside_triangles
-from mien.training.parts import BatchFrame, Preparation, Step, TrainingPart
 from mien.training.whole_head.completion import complete_colors
 
 _MOUTH_CLOSED_AT = 0.5
@@ -28,67 +26,35 @@ reset of the presets, from which surface that is hardly ever seen does not recov
 (log, "Mouth")."""
 
 
-@dataclass(frozen=True, eq=False)
-class Inside:
-    """The surface inside a mouth, and its colours where pictures do not show it."""
-
-    triangles: Bool[Tensor, " f"]
-    """Mouth, teeth and tongue."""
-    colors: Float[Tensor, "f 3"]
-    """Colours that are plausible, 0..1: a dark mouth with light teeth."""
-
-    def fill_interior(self, surface: BoundSurface, step: int, steps: int) -> None:
-        """Close the surface where it is open, if this is a step of a run of `steps` at which this is due."""
-        if step == round(_MOUTH_CLOSED_AT * steps):
-            surface.fill_interior(self.triangles, FILL_OPACITY, self.colors)
-
-    def to(self, like: Tensor) -> "Inside":
-        """The same on the device of `like`, with colours of its dtype."""
-        return Inside(self.triangles.to(like.device), self.colors.to(like))
-
-
-def prepare_inside(given: Preparation) -> TrainingPart | None:
-    """The part of a training that covers and fills what is inside a head, if the settings ask for it."""
-    avatar, surface, settings = given.avatar, given.avatar.surface(), given.settings
-    if settings.inside == "free" or surface is None:
-        return None
-
-    def covered(posed: Posed, one: BatchFrame) -> Posed:
-        return cover_hidden(posed, avatar, one.target.hidden, cover_random(settings, one.number))
-
-    hideable = inside_triangles(given.face_model)
-    if settings.inside == "covered":
-        return TrainingPart("inside", hideable, posed=covered)
-    inside = inside_of(avatar, given.coverage).to(given.like)
-
-    def fill_interior(step: Step) -> None:
-        for one in step.batch:
-            inside.fill_interior(surface, one.number, settings.steps)
-
-    return TrainingPart("inside", hideable, posed=covered, before_step=fill_interior)
+def fill_interior(
+    surface: BoundSurface, face_model: FaceModel, colors: Float[Tensor, "f 3"], step: int, steps: int
+) -> None:
+    """Close the mouth where it is open, if this is a step of a run of `steps` at which this is due."""
+    if step == round(_MOUTH_CLOSED_AT * steps):
+        surface.fill_interior(head_parts(face_model).interior.to(colors.device), colors)
 
 
 @torch.no_grad()
-def inside_of(avatar: Avatar, covered: Coverage) -> Inside:
-    """What is inside an avatar's mouth. The avatar is on the CPU.
+def interior_colors(avatar: Avatar, covered: Coverage) -> Float[Tensor, "f 3"]:
+    """Plausible colours inside an avatar's mouth: dark, with light teeth. The avatar is on the CPU.
 
-    The mesh cannot say which part of a mouth pictures show, so all of it has made-up colours.
+    The mesh cannot say which part of a mouth pictures show, so all of it has completed colours.
     """
     model, interior = avatar.face_model, head_parts(avatar.face_model).interior
     neutral = model.head_vertices(avatar.subject)[0].detach().float()
     seen = torch.where(interior, 0.0, covered.seen)
-    return Inside(interior, complete_colors(model.to(neutral), neutral, seen, covered.colors))
+    return complete_colors(model.to(neutral), neutral, seen, covered.colors)
 
 
-def cover_hidden(posed: Posed, avatar: Avatar, hidden: Bool[Tensor, " f"] | None, random: torch.Generator) -> Posed:
+def cover_hidden(
+    posed: Posed, surface: BoundSurface, hidden: Bool[Tensor, " f"] | None, random: torch.Generator
+) -> Posed:
     """Give hidden Gaussians one colour, drawn at random, so that they can explain nothing and have to be covered.
 
     Their opacities have no gradient: they must not fade because a skin that is still thin lets them through. Their
-    places and sizes do have one, and so they leave where they do not belong. Gaussians of methods that bind none to
-    triangles stay as they are.
+    places and sizes do have one, and so they leave where they do not belong.
     """
-    surface = avatar.surface()
-    if hidden is None or surface is None:
+    if hidden is None:
         return posed
     gaussians, own = posed.gaussians, hidden.index_select(0, surface.triangles())
     color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)

@@ -7,7 +7,6 @@ What lies inside stays where tracking put it: hair and hanging things stand out 
 scalp moves as a whole, because pictures from the front show its highest points alone, and these would be cut flat.
 """
 
-from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,8 +22,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.machine.threads import one_torch_thread
-from mien.training.footage.frames import Frame, spread_frames
-from mien.training.footage.sequence import Sequence
+from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.unseen import fills_sides
 
@@ -56,8 +54,6 @@ _OPAQUE = 128
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One frame, as the descent sees it."""
-
     camera: Camera
     outside: Float[Tensor, "1 1 h w"]
     """Distance of each pixel from the matte, in pixels; 0 inside."""
@@ -77,41 +73,27 @@ class _View:
         return (metres.square() / (metres + _OUTLINE_ROBUST)).mean()
 
 
-def fitted_faces(
-    face_model: FaceModel, sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, *, bound: bool
-) -> list[FaceParams] | None:
-    """The tracked face parameters of each sequence with a mesh that lies inside the mattes. None if it stays as it is.
+def fitted_faces(footage: Footage, settings: TrainSettings, *, bound: bool) -> list[FaceParams] | None:
+    """The face parameters of each sequence with a mesh that lies inside the mattes. None if it stays as it is.
 
     `bound` says whether the avatar's Gaussians are bound to the mesh. To others it does not matter.
     """
-    wanted = settings.mesh == "fitted" or (settings.mesh == "auto" and fills_sides(frames, settings, bound=bound))
+    filled = fills_sides(footage.frames, settings, bound=bound)
+    wanted = settings.mesh == "fitted" or (settings.mesh == "auto" and filled)
     if not (bound and wanted):
         return None
-    faces = [sequence.tracking.face for sequence in sequences]
     with one_torch_thread():  # so that the bytes do not depend on the number of threads
-        offsets = fit_to_outlines(face_model, sequences, faces, frames)
-    return [replace(face, vertex_offsets=offsets) for face in faces]
+        offsets = fit_to_outlines(footage)
+    return [replace(face, vertex_offsets=offsets) for face in footage.faces]
 
 
-def fit_to_outlines(
-    face_model: FaceModel,
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-    threads: int | None = None,
-) -> Float[Tensor, "v 3"]:
+def fit_to_outlines(footage: Footage) -> Float[Tensor, "v 3"]:
     """Return offsets of the subject's vertices with which the mesh lies inside the mattes, in metres.
 
-    They contain the offsets that `faces` already have. Poses and expressions stay as they are.
-
-    Args:
-        face_model: The face model, float32 on the CPU.
-        sequences: The sequences that the frames count in.
-        faces: Face parameters of each sequence, with all its timesteps.
-        frames: The frames to look at. At most `outline_frames` of them, evenly spread, are used. Of these, frames with
-            an empty matte say nothing.
-        threads: Number of frames that are read at a time; by default, MIEN_THREADS or all cores. It changes no bit.
+    They contain the offsets that the faces already have. Poses and expressions stay as they are. At most 48 frames,
+    evenly spread, are looked at. Of these, frames with an empty matte say nothing.
     """
+    face_model, faces = footage.face_model, footage.faces
     given = faces[0].vertex_offsets
     start = torch.zeros_like(face_model.template) if given is None else given.detach()
     rest = face_model.rest_vertices(faces[0]).detach()
@@ -122,17 +104,14 @@ def fit_to_outlines(
     own = weights[outer]
 
     def view(frame: Frame) -> _View:
-        sequence, face = sequences[frame.sequence], faces[frame.sequence][frame.timestep]
-        outside = torch.from_numpy(_distance(sequence.capture.mattes[frame[1:]]))[None, None]
-        world = face_model(face)[0].detach()[outer]
-        return _View(sequence.tracking.cameras[frame.camera], outside, world, face.T_world_head[0, :3, :3])
-
-    def shows_person(frame: Frame) -> bool:
-        return bool((sequences[frame.sequence].capture.mattes[frame[1:]] >= _OPAQUE).any())
+        outside = torch.from_numpy(_distance(footage.matte(frame)))[None, None]
+        turn = footage.face(frame).T_world_head[0, :3, :3]
+        return _View(footage.camera(frame), outside, footage.vertices(frame).detach()[outer], turn)
 
     # Without an opaque pixel, all distances are infinite.
-    looked = [frame for frame in spread_frames(frames, _OUTLINE_FRAMES) if shows_person(frame)]
-    views = list(stream_in_threads(view, looked, threads))
+    spread = spread_frames(footage.frames, _OUTLINE_FRAMES)
+    looked = [frame for frame in spread if bool((footage.matte(frame) >= _OPAQUE).any())]
+    views = list(stream_in_threads(view, looked))
     rounds = _OUTLINE_ROUNDS if views else 0
     shifts, first, second = (torch.zeros(weights.shape[1], 3) for _ in range(3))
     random = torch.Generator().manual_seed(0)
@@ -186,13 +165,7 @@ def spread_points(vertices: Float[Tensor, "v 3"], spacing: float) -> list[int]:
 
 
 def smooth_weights(vertices: Float[Tensor, "v 3"], points: Float[Tensor, "a 3"], reach: float) -> Float[Tensor, "v a"]:
-    """Return the share of each point in each vertex: Gaussians of the distance, with the sum 1.
-
-    Args:
-        vertices: A mesh, in metres.
-        points: Some points, in metres.
-        reach: Standard deviation of the Gaussians, in metres.
-    """
+    """Return the share of each point in each vertex: Gaussians of the distance with the sum 1. Lengths in metres."""
     weights = _gaussians(vertices, points, reach)
     return weights / weights.sum(1, keepdim=True)
 
@@ -212,5 +185,4 @@ def _outer_vertices(face_model: FaceModel) -> Bool[Tensor, " v"]:
 
 
 def _distance(matte: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The distance of each pixel from the half opaque part of a matte, in pixels."""
     return cv2.distanceTransform((matte < _OPAQUE).astype(np.uint8), cv2.DIST_L2, 5)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Posed
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.camera import Camera
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
@@ -109,12 +109,8 @@ class SideViews:
     def drawn(self, face: FaceParams, camera: Camera, step: int, random: torch.Generator) -> Callable[[], SideView]:
         """A function that makes the side view of a step. It does not depend on the avatar, and any thread may call it.
 
-        Args:
-            face: One timestep, on any device. Its joints and its place are kept, and its expression is that of views
-                from the side.
-            camera: The camera in front of the head.
-            step: The step, which says whether the head is turned or the expression raised.
-            random: Draws the angle and the coefficients.
+        The joints and the place of a face are kept, and so is its expression in views from the side. The step says
+        whether the head is turned or the expression raised.
         """
         raised = step % _SIDE_VIEWS_EVERY != 0
         angle = _drawn_angle(raised, random)
@@ -131,13 +127,7 @@ class SideViews:
         return partial(self._made, SideViewPlan(face, raised, small, background, posed, up))
 
     def loss(self, avatar: Avatar, view: SideView, progress: Progress) -> Float[Tensor, ""]:
-        """The weighted difference between the avatar and the completed mesh in one side view.
-
-        Args:
-            avatar: The avatar, on the device of the view's face.
-            view: The view.
-            progress: How far training is.
-        """
+        """The weighted difference between the avatar and the completed mesh in one side view."""
         plan, like = view.plan, view.plan.face.expression
         posed = avatar.pose(plan.face, progress)
         seen = rasterize(posed.gaussians.timestep(0), plan.camera, plan.background.to(like))
@@ -151,7 +141,6 @@ class SideViews:
 
     @torch.no_grad()
     def _made(self, plan: SideViewPlan) -> SideView:
-        """The view with the pictures that it is compared with."""
         camera, faces = plan.camera.to(self.colors), self.face_model.faces
         raised = plan.vertices + self.height[:, None] * vertex_normals(plan.vertices, faces)
         index = rasterize_mesh(raised, faces, camera).face_index.long()
@@ -178,13 +167,9 @@ class SideViews:
 def side_views(
     face_model: FaceModel, weight: float, colors: Float[Tensor, "f 3"], height: Float[Tensor, " f"]
 ) -> SideViews:
-    """The side views of a head.
+    """The side views of a head with completed colours, 0..1, and heights of the surface above triangles, in metres.
 
-    Args:
-        face_model: The face model, on the CPU in float32.
-        weight: Weight of the loss.
-        colors: Completed colours of the triangles, 0..1.
-        height: Height of the surface above each triangle, in metres, which is that of fills.
+    All is on the CPU in float32.
     """
     parts, over = head_parts(face_model), _at_vertices(face_model, height)
     compared = parts.skin | parts.interior | torch.stack(parts.painted).any(0)
@@ -193,15 +178,14 @@ def side_views(
 
 
 def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Tensor, " v"]:
-    """The mean value of the triangles around each vertex."""
     return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
 
 
-def side_views_of(avatar: Avatar, unseen: Unseen | None, weight: float) -> SideViews | None:
+def side_views_of(face_model: FaceModel, unseen: Unseen | None, weight: float) -> SideViews | None:
     """The side views of a filled head, or None if nothing is filled or the weight is 0."""
     if unseen is None or unseen.prior.filled_in is None or weight == 0:
         return None
-    model, prior = avatar.face_model, unseen.prior
+    model, prior = face_model, unseen.prior
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
     assert prior.colors is not None
     return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
@@ -232,7 +216,6 @@ def turned_to_side(face: FaceParams, angle: float) -> FaceParams:
 
 
 def _drawn_angle(raised: bool, random: torch.Generator) -> float:
-    """An angle to either side, in radians."""
     share, side = torch.rand(2, generator=random, dtype=torch.float64).tolist()
     aside = (_SIDE_VIEWS_LEAST_ANGLE, _SIDE_VIEWS_MOST_ANGLE)
     low, high = (0.0, _RAISED_MOST_ANGLE) if raised else aside

@@ -11,6 +11,7 @@ from mien.avatar.avatar import Avatar
 from mien.gaussians import world_means
 from mien.runtime.baked import PortableAvatar
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
+from mien.training.footage.coverage import smoothstep
 
 SOFT_CUT_WIDTH = 0.03
 """Distance from the neck cut over which opacity fades where a head is shown, in metres. 2 to 4 cm were looked at on
@@ -37,14 +38,8 @@ _PART = 4096
 def with_soft_cut(portable: PortableAvatar, avatar: Avatar) -> PortableAvatar:
     """The record of an avatar whose opacity fades towards the neck cut.
 
-    Training and scoring cut heads off sharply, because their truth is cut off sharply. What is shown need not be.
-
-    Args:
-        portable: The record of `avatar`.
-        avatar: The avatar. Its neck at rest places the cut.
-
-    Returns:
-        The record with other raw opacities. It is `portable` if its Gaussians have none of their own.
+    Training and scoring cut heads off sharply, because their truth is cut off sharply. What is shown need not be. The
+    avatar's neck at rest places the cut. Records whose Gaussians have no opacities of their own stay as they are.
     """
     attributes = getattr(portable.baked, "attributes", None)
     if attributes is None:
@@ -78,32 +73,20 @@ def opacity_shares(
 ) -> Float[Tensor, " n"]:
     """The share of each opacity that is left: 0 at the cut, 1 far from it and on the head.
 
-    Just above the cut, what stands off the skin fades as well: shards of collars, and corners where a neck widens.
-
-    Args:
-        centers: Centres of the Gaussians at rest, in the world, in metres.
-        cut: The neck cut at rest.
-        head: Vertices of the head without its neck, in the world. What is close to them is not cut off.
-        skin: Points of the mesh, in the world.
+    Just above the cut, what stands off the skin fades as well: shards of collars, and corners where a neck widens. What
+    is close to the head is not cut off. All is at rest in the world, in metres.
     """
-    shares = _smoothstep(cut.margins(centers) / SOFT_CUT_WIDTH) ** _SOFT_CUT_POWER
+    shares = smoothstep(cut.margins(centers) / SOFT_CUT_WIDTH) ** _SOFT_CUT_POWER
     low, high = SOFT_CUT_COLLAR
-    above = _smoothstep((cut.heights(centers) - low) / (high - low))
+    above = smoothstep((cut.heights(centers) - low) / (high - low))
     near = (shares < 1) | (above < 1)  # distances take time, and most Gaussians are far above
     close, off = SOFT_CUT_OFF_SKIN
-    on_skin = _smoothstep((off - _distances(centers[near], skin)) / (off - close))
+    on_skin = smoothstep((off - _distances(centers[near], skin)) / (off - close))
     first, last = SOFT_CUT_HEAD
-    on_head = _smoothstep((last - _distances(centers[near], head)) / (last - first))
+    on_head = smoothstep((last - _distances(centers[near], head)) / (last - first))
     shares[near] = torch.maximum(shares[near] * torch.maximum(on_skin, above[near]), on_head)
     return shares
 
 
 def _distances(centers: Float[Tensor, "n 3"], points: Float[Tensor, "m 3"]) -> Float[Tensor, " n"]:
-    """The distance of each centre to the nearest point."""
     return torch.cat([torch.cdist(part, points).amin(1) for part in centers.split(_PART)])
-
-
-def _smoothstep(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """0 below 0, 1 above 1, and between them without a corner."""
-    x = x.clamp(0, 1)
-    return x * x * (3 - 2 * x)

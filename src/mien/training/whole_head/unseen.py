@@ -9,7 +9,6 @@ because the hair above them is on the outline.
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,25 +16,20 @@ from torch.nn.functional import softshrink
 
 from mien.arrays import clear_rows
 from mien.avatar.avatar import Avatar
-from mien.avatar.bound_surface import SurfacePrior
-from mien.avatar.density import DensityControl
+from mien.avatar.bound_surface import BoundSurface, SurfacePrior
+from mien.avatar.density import DensityControl, GradientDensity
 from mien.avatar.settings import Photometric
-from mien.avatar.store import GaussianStore
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
-from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.render.rendering import Rendering
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
-from mien.training.footage.frames import Frame, spread_frames
+from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.hidden import hidden_triangles
-from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings
-from mien.training.whole_head.back_hair import back_hair
-from mien.training.whole_head.completion import complete_colors, vertex_means
-from mien.training.whole_head.hair_height import hair_height, hanging_hair
-from mien.training.whole_head.spreading import Surface
+from mien.training.whole_head.completion import Surface, complete_colors, vertex_means
+from mien.training.whole_head.hair_height import back_hair, hair_height, hanging_hair
 
 UNSEEN_CONFIDENCE = 0.02
 """Confidence below which a triangle is made up. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90
@@ -83,21 +77,24 @@ class Unseen:
         """Whether some sides are filled rather than trained."""
         return self.prior.filled_in is not None
 
+    def to(self, like: Tensor) -> "Unseen":
+        """The same on the device of `like`."""
+        return replace(self, prior=self.prior.to(like))
+
     def weights(self, weights: Photometric) -> Photometric:
         """The weights of the losses, with a loss of alpha if anything is filled."""
         if not self.fills:
             return weights
         return replace(weights, alpha_weight=max(weights.alpha_weight, _FILL_ALPHA_WEIGHT))
 
-    def filled_in(self, avatar: Avatar) -> Bool[Tensor, " n"] | None:
+    def filled_in(self, surface: BoundSurface) -> Bool[Tensor, " n"] | None:
         """The Gaussians that are filled rather than trained."""
-        surface = avatar.surface()
         filled_in = self.prior.filled_in
-        return None if filled_in is None or surface is None else filled_in.index_select(0, surface.triangles())
+        return None if filled_in is None else filled_in.index_select(0, surface.triangles())
 
-    def mask_gradients(self, avatar: Avatar, *renderings: Rendering) -> None:
-        """Take the gradients from what is made up, after the backward pass, but for strong ones of its height."""
-        filled_in = self.filled_in(avatar)
+    def mask_gradients(self, avatar: Avatar, surface: BoundSurface, *renderings: Rendering) -> None:
+        """Take the gradients from what is filled, after the backward pass, but for strong ones of its height."""
+        filled_in = self.filled_in(surface)
         if filled_in is None:
             return
         store = avatar.gaussian_store()
@@ -123,32 +120,23 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
     return settings.unseen == "filled"
 
 
-def spare_fills(avatar: Avatar, density: DensityControl, unseen: Unseen) -> DensityControl:
-    """An avatar's density control. Closed surfaces keep their opacity at resets; fills do not count to its limit."""
-    if unseen.prior.closed is None:
+def spare_fills(surface: BoundSurface, density: DensityControl, unseen: Unseen) -> DensityControl:
+    """A density control by which closed surfaces keep their opacity at resets, and fills do not count to its limit."""
+    closed, filled_in = unseen.prior.closed, unseen.filled_in(surface)
+    if closed is None or not isinstance(density, GradientDensity):
         return density
-
-    def may_reset(store: GaussianStore) -> Bool[Tensor, " n"]:
-        closed, surface = unseen.prior.closed, avatar.surface()
-        assert closed is not None
-        assert surface is not None
-        return ~closed[surface.triangles()]
-
-    filled_in = unseen.filled_in(avatar)
-    return density.sparing(may_reset, 0 if filled_in is None else int(filled_in.sum()))
+    extra = 0 if filled_in is None else int(filled_in.sum())
+    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + extra)
+    return replace(density, settings=settings, may_reset=lambda store: ~closed[surface.triangles()])
 
 
 @torch.no_grad()
-def unseen_of(
-    avatar: Avatar, sequences: Items[Sequence], faces: Items[FaceParams], frames: Items[Frame], *, filled: bool
-) -> Unseen:
-    """What some frames show of an avatar's head. The avatar is on the CPU, in float32."""
-    model = avatar.face_model
-    hair = hair_height(model, sequences, faces, frames)
-    hanging = hanging_hair(model, sequences, faces, frames)
+def unseen_of(avatar: Avatar, footage: Footage, *, filled: bool) -> Unseen:
+    """What the frames show of an avatar's head. The avatar is on the CPU, in float32."""
+    model, hair, hanging = avatar.face_model, hair_height(footage), hanging_hair(footage)
     if not filled:
         return Unseen(None, SurfacePrior(hair, hanging))
-    found = measure_coverage(model, sequences, faces, frames)
+    found = measure_coverage(footage)
     neutral = model.head_vertices(avatar.subject)[0].detach()
     parts = head_parts(model)
     # The mesh cannot say exactly which part of a mouth a picture shows, so no colour from there is believed.
@@ -156,17 +144,17 @@ def unseen_of(
     colors = complete_colors(model, neutral, seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
-    if avatar.surface() is None:
-        return Unseen(found, SurfacePrior(hair, hanging, colors, doubt))
     filled_in = (shown < UNSEEN_CONFIDENCE) & (found.above > 0.5)
     outside = (found.above > 0.5) & ~parts.interior
     behind_head = back_hair(model, neutral, hair, hanging)
-    drawn = drawn_at_height(model, torch.maximum(hair, behind_head), sequences, faces, frames)
+    drawn = drawn_at_height(footage, torch.maximum(hair, behind_head))
     filled_in &= ~(outside & beside_shown(model, neutral, outside & (drawn | ~filled_in)))
-    filled_in |= hidden_inside(model, parts.interior, sequences, faces, frames)
+    filled_in |= hidden_inside(footage, parts.interior)
     widening = wider_where_faces_move(model, neutral, parts.interior)
     behind = filled_in & (behind_head > hair)
-    colors = torch.where(behind[:, None], _hair_colors(model, neutral, parts.scalp, behind, colors), colors)
+    # The colours of the scalp go on over triangles behind hanging hair.
+    of_hair = Surface.of(neutral, model.faces).spread(colors, parts.scalp.to(colors), parts.scalp | behind)
+    colors = torch.where(behind[:, None], of_hair, colors)
     hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
     strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_LEAST_HEIGHT)
     return Unseen(
@@ -174,35 +162,24 @@ def unseen_of(
     )
 
 
-def drawn_at_height(
-    face_model: FaceModel,
-    height: Float[Tensor, " f"],
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-) -> Bool[Tensor, " f"]:
+def drawn_at_height(footage: Footage, height: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
     """Which triangles are in front somewhere in the head of some picture if the mesh is as high as the hair.
 
-    Args:
-        face_model: The face model.
-        height: Height of hair above each triangle, in metres.
-        sequences: The sequences that the frames count in.
-        faces: Face parameters of each sequence.
-        frames: The frames to look at. Some of them are used, evenly spread.
+    Heights are in metres. Some of the frames are used, evenly spread.
     """
-    over = vertex_means(face_model, height[:, None].expand(-1, 3))[:, 0]
+    faces, over = footage.face_model.faces, vertex_means(footage.face_model, height[:, None].expand(-1, 3))[:, 0]
 
     def drawn_in(frame: Frame) -> Bool[Tensor, " f"]:
-        sequence, vertices = sequences[frame.sequence], face_model(faces[frame.sequence][frame.timestep])[0]
-        raised = vertices + over[:, None] * vertex_normals(vertices, face_model.faces)
-        index = rasterize_mesh(raised, face_model.faces, sequence.tracking.cameras[frame.camera]).face_index
-        head = torch.from_numpy(np.array(sequence.scoring[frame[1:]])) > 127
-        drawn = torch.zeros(len(face_model.faces), dtype=torch.bool)
+        vertices = footage.vertices(frame)
+        raised = vertices + over[:, None] * vertex_normals(vertices, faces)
+        index = rasterize_mesh(raised, faces, footage.camera(frame)).face_index
+        head = torch.from_numpy(footage.scoring(frame)) > 127
+        drawn = torch.zeros(len(faces), dtype=torch.bool)
         drawn[index[head & (index >= 0)].long()] = True
         return drawn
 
-    result = torch.zeros(len(face_model.faces), dtype=torch.bool)
-    for drawn in stream_in_threads(drawn_in, spread_frames(frames, _HEIGHT_FRAMES)):
+    result = torch.zeros(len(faces), dtype=torch.bool)
+    for drawn in stream_in_threads(drawn_in, spread_frames(footage.frames, _HEIGHT_FRAMES)):
         result |= drawn
     return result
 
@@ -212,10 +189,7 @@ def beside_shown(
 ) -> Bool[Tensor, " f"]:
     """Which triangles are so near to those that pictures show that hair above them is on the outline of some picture.
 
-    Args:
-        face_model: The face model.
-        vertices: The person's neutral head in the head frame, in metres.
-        shown: Triangles of the outside that pictures show.
+    The vertices are those of the neutral head, in metres.
     """
     if not bool(shown.any()):
         return torch.zeros_like(shown)
@@ -224,26 +198,12 @@ def beside_shown(
     return apart < OUTLINE_BAND
 
 
-def _hair_colors(
-    face_model: FaceModel,
-    vertices: Float[Tensor, "v 3"],
-    scalp: Bool[Tensor, " f"],
-    behind: Bool[Tensor, " f"],
-    colors: Float[Tensor, "f 3"],
-) -> Float[Tensor, "f 3"]:
-    """Colours in which those of the scalp go on over triangles behind hanging hair."""
-    return Surface.of(vertices, face_model.faces).spread(colors, scalp.to(colors), scalp | behind)
-
-
 def wider_where_faces_move(
     face_model: FaceModel, vertices: Float[Tensor, "v 3"], interior: Bool[Tensor, " f"]
 ) -> Float[Tensor, " f"]:
     """Factors on the limits to the surface: above 1 at and around lips and lids, and inside the mouth.
 
-    Args:
-        face_model: The face model.
-        vertices: The person's neutral head in the head frame, in metres.
-        interior: Triangles inside the mouth.
+    The vertices are those of the neutral head, in metres.
     """
     middles, moving = vertices[face_model.faces.long()].mean(1), face_model.region_mask(*_MOVING)
     if not bool(moving.any()):
@@ -254,37 +214,15 @@ def wider_where_faces_move(
     return 1 + (_MOVING_WIDENING - 1) * torch.where(interior, 1.0, near)
 
 
-def hidden_inside(
-    face_model: FaceModel,
-    interior: Bool[Tensor, " f"],
-    sequences: Items[Sequence],
-    faces: Items[FaceParams],
-    frames: Items[Frame],
-) -> Bool[Tensor, " f"]:
+def hidden_inside(footage: Footage, interior: Bool[Tensor, " f"]) -> Bool[Tensor, " f"]:
     """Which triangles inside a mouth hardly any picture shows, because lips, cheeks or tongue are in front of them."""
 
     def shown_in(frame: Frame) -> Bool[Tensor, " f"]:
-        vertices = face_model(faces[frame.sequence][frame.timestep])[0]
-        camera = sequences[frame.sequence].tracking.cameras[frame.camera]
-        return interior & ~hidden_triangles(vertices, face_model, interior, camera)
+        hidden = hidden_triangles(footage.vertices(frame), footage.face_model, interior, footage.camera(frame))
+        return interior & ~hidden
 
-    looked = spread_frames(frames, _MOUTH_FRAMES)
+    looked = spread_frames(footage.frames, _MOUTH_FRAMES)
     sights = torch.zeros(len(interior))
     for shown in stream_in_threads(shown_in, looked):
         sights += shown
     return interior & (sights < _MOUTH_SHOWN_SHARE * len(looked))
-
-
-def moved(unseen: Unseen, like: Tensor) -> Unseen:
-    """The same on the device of `like`."""
-    prior = unseen.prior
-    put = {
-        "hanging": None if prior.hanging is None else prior.hanging.to(like),
-        "colors": None if prior.colors is None else prior.colors.to(like),
-        "doubt": None if prior.doubt is None else prior.doubt.to(like),
-        "filled_in": None if prior.filled_in is None else prior.filled_in.to(like.device),
-        "closed": None if prior.closed is None else prior.closed.to(like.device),
-        "strands": None if prior.strands is None else prior.strands.to(like.device),
-        "widening": None if prior.widening is None else prior.widening.to(like),
-    }
-    return replace(unseen, prior=SurfacePrior(prior.hair.to(like), **put))

@@ -27,7 +27,6 @@ def scale(context: Context) -> PartResult:
     assert isinstance(config, GaussianAvatarsConfig)
     usual = GaussianAvatarsConfig()
     threshold = config.scale_threshold or usual.scale_threshold
-    config = replace(config, scale_weight=config.scale_weight or usual.scale_weight)
     context.say_how_long("scale", 2)
     names = (f"threshold {threshold:g}", "no threshold (0)")
     variants = [

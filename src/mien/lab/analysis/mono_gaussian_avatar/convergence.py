@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from mien.avatar.avatar import Avatar
-from mien.avatar.schedules import Progress
+from mien.avatar.settings import Progress
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -23,11 +23,11 @@ from mien.training.footage.frames import (
     FrameOrder,
     camera_extent,
     expression_rarity,
-    resolved,
     spread_frames,
     training_frames,
 )
 from mien.training.footage.sequence import Targets
+from mien.training.settings import resolved
 from mien.training.trainer import TrainingData, pretrain, start, step
 
 TIMES = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.avatar.avatar import ParameterGroup
-from mien.avatar.settings import FaceTuning
+from mien.avatar.settings import FaceTuning, Rate
 from mien.avatar.store import Moments
 from mien.face.params import FaceParams
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
@@ -24,8 +24,6 @@ _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """One timestep of a track."""
-
     face: FaceParams
     groups: list[ParameterGroup]
 
@@ -33,15 +31,9 @@ class _Row:
 class FaceTrack:
     """One tensor per field, indexed by timestep, with the optimiser's state. The tensors start from the tracking.
 
-    Each timestep has its own moments and step counts. A step changes only its own timestep.
-
-    Args:
-        face: All timesteps of all sequences, one sequence after the other.
-        tuning: Whether and how fast they change.
-        lengths: Number of timesteps of each sequence. Default: one sequence.
-        bounds: Range of each expression coefficient, for settings that keep to it. Default: no bounds.
-        away: `turns_from_mean` of `face`. By default it is computed, which waits for a GPU that holds `face`.
-        trained: Indices of the timesteps that training uses. Default: all.
+    Each timestep has its own moments and step counts. A step changes only its own timestep. `face` has all timesteps of
+    all sequences, one after the other, with `lengths` timesteps each. `trained` are the indices of those that training
+    uses (default: all), and `away` is `turns_from_mean`, which would wait for a GPU.
     """
 
     def __init__(
@@ -130,8 +122,8 @@ class FaceTrack:
         groups = []
         for name, state in self._moments.items():
             row = Moments(state.first[index : index + 1], state.second[index : index + 1], state.step[index])
-            rate = getattr(self._tuning, name)
-            groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}))
+            rate, begin = Rate(getattr(self._tuning, name)), self._tuning.begin
+            groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}, begin=begin))
         return _Row(replace(self._start, **rows), groups)
 
     def params(self) -> FaceParams:
@@ -209,9 +201,7 @@ def mean_pose_correction(tracked: FaceParams, tuned: FaceParams) -> tuple[Float[
 def turns_from_mean(tracked: FaceParams, trained: Items[int] | None = None) -> Float[Tensor, "t 3"]:
     """Return the rotation vectors of head poses from their mean, in radians, in float64 on the CPU.
 
-    Args:
-        tracked: The poses.
-        trained: Indices of those that the mean is taken over. Default: all.
+    The mean is that of the `trained` ones (default: all).
     """
     rotations = tracked.T_world_head[:, :3, :3].double().cpu()
     own = rotations if trained is None else rotations[list(trained)]
@@ -229,13 +219,8 @@ def without_turns(
     """Corrections without the part that is linear in the head's turns. Their mean stays.
 
     All sequences share the slopes, which come from the turns within each of them: how a sequence differs from another
-    may have other reasons.
-
-    Args:
-        corrections: The corrections, on any device.
-        away: `turns_from_mean` of the same timesteps, on the CPU, so that nothing here waits for a GPU.
-        sequence: Index of each timestep's sequence, on the CPU.
-        known: Which timesteps decide how corrections follow turns, on the CPU. Default: all.
+    may have other reasons. `away` is `turns_from_mean`, and `known` says which timesteps decide (default: all). All but
+    the corrections is on the CPU, so that nothing waits for a GPU.
     """
     known = torch.ones(len(away), dtype=torch.bool) if known is None else known
     within, places = away[known], sequence[known]
@@ -248,13 +233,7 @@ def without_turns(
 
 
 def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:
-    """Give the timesteps that are not `seen` corrections `tuned - tracked`, interpolated from the others, in place.
-
-    Args:
-        tuned: Parameters after training, [t, ...].
-        tracked: Parameters before training, [t, ...].
-        seen: Which timesteps training has used, bool [t].
-    """
+    """Give the timesteps that are not `seen` corrections `tuned - tracked`, interpolated from the others, in place."""
     if not bool(seen.any()) or bool(seen.all()) or tuned.numel() == 0:
         return
     known, unseen = seen.nonzero()[:, 0].numpy(), (~seen).nonzero()[:, 0].numpy()

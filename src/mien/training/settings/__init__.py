@@ -1,21 +1,18 @@
-"""TrainSettings, the settings of a run that do not depend on the method, and presets of them. Needs no torch."""
+"""Settings of a run that do not depend on the method, their presets, and those of the alignment. Needs no torch."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from mien.avatar.methods import method_named
 from mien.avatar.settings import Differences, MethodConfig
-from mien.disk.config import FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges, overlay
+from mien.disk.config import COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges, overlay
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.machine.devices import DeviceName
 
 Split = Literal["blocks", "tail", "none", "gaussian-avatars", "nersemble-benchmark", "dataset"]
-"""Name of the rule that holds out timesteps (`mien.training.held_out`). gaussian-avatars holds out a sequence and a
-camera instead (`mien.training.splits.named`), and so does nersemble-benchmark
-(`mien.training.splits.benchmark`). dataset holds out what the authors of an imported dataset held out
-(`mien.training.splits.own`)."""
+"""Name of a split (`mien.training.settings.splits`)."""
 
 
 @dataclass(frozen=True)
@@ -29,67 +26,51 @@ class TrainSettings:
     """Number of training frames, one for each optimiser step. All schedules stretch with it. A method may use several
     frames in one optimiser step, which then counts as so many."""
     split: Split = "blocks"
-    """Held-out frames: every fifth block of 10 timesteps (blocks), the last 20 % (tail), or nothing (none).
-    gaussian-avatars is the split of that paper on NeRSemble: a sequence of each subject, and camera 08.
-    nersemble-benchmark is that of the benchmark: four sequences, and all cameras but the frontal one. dataset is the
-    split of an imported dataset's authors (docs/datasets.md)."""
+    """What is held out (`mien.training.settings.splits`)."""
     background: Literal["white", "mixed", "random", "auto"] = "auto"
-    """Background of the training pictures. A random colour in each step keeps Gaussians from imitating the background,
-    which can show as white dots from the side and white needles in new poses. It costs 0.2 to 0.6 dB compared with
-    white. Mixed is random in one of ten steps and white in the others: it costs next to nothing, ears and hair
-    stay clean, and cheeks nearly so. Auto: mixed where sides are filled (`--training.unseen`), else white."""
+    """Background of the training pictures. A random colour in each step keeps Gaussians from imitating white, which can
+    show as white dots and needles; it costs 0.2 to 0.6 dB. Mixed, random in one of ten steps, costs next to nothing.
+    Auto: mixed where sides are filled (`--training.unseen`), else white."""
     edges: Literal["filmed", "cleaned", "auto"] = "auto"
-    """Colours at soft edges of the matte, where a pixel holds some of the filmed background. Filmed: as they are; an
-    avatar learns the background in them and shows it as slivers on hair and neck, from the side and over other
-    backgrounds. Cleaned: the colours of the person alone, as estimated from what is solid nearby. Auto: cleaned where
-    sides are filled (`--training.unseen`), else filmed. Scores do not depend on it (`mien evaluate --edges`)."""
+    """Colours at soft edges of the matte, where a pixel holds some of the filmed background: as they are, which can
+    show as slivers over other backgrounds (filmed), or those of the person alone, as estimated (cleaned). Auto: cleaned
+    where sides are filled (`--training.unseen`), else filmed."""
     frame_order: Literal["even", "rare"] = "even"
     """How often frames are drawn: each equally often, or those with a rare expression up to four times as often as
     those with a common one."""
     camera_colors: Literal["none", "first", "mean"] = "none"
     """Whether a change of colours is learned for each camera, for rigs whose cameras differ in exposure or white
-    balance. It is used only in training: the avatar has the colours of the first camera (first), or those between all
-    cameras (mean). A step takes longer with it."""
+    balance. The avatar has the colours of the first camera (first), or those between all cameras (mean)."""
     light: Literal["steady", "changing", "auto"] = "auto"
     """Whether a gain of three numbers is learned for each timestep, for videos whose exposure, white balance or lamps
-    change. It is used only in training and in scores: the avatar has the mean light. The gain of a held-out timestep
-    is interpolated in time from those that are trained on. Auto: changing if one camera filmed and the brightness of
-    the face changes by a factor of more than 1.35, else steady."""
-    camera_color_rate: Annotated[float, POSITIVE] = 1e-3
-    """Learning rate of these changes and gains, per step. It ends at a tenth."""
+    change. The avatar has the mean light. Auto: changing if one camera filmed and the brightness of the face changes
+    by a factor of more than 1.35, else steady."""
     unseen: Literal["trained", "filled", "auto"] = "auto"
-    """Sides of the head that no training picture shows. Trained: they may move and help to explain pictures, and look
-    broken from the side. Filled: they are a closed surface in completed colours from the first step on, and so is what
-    no picture shows of the inside of the mouth; what is seen is kept flat on the mesh, less so around mouth and eyes;
-    and alpha is compared with the matte (weight 1 or more). Auto: filled if one camera filmed, trained if there are
-    several. Methods that bind no Gaussians to triangles train all sides in either case."""
+    """Sides of the head that no training picture shows. Trained: they may help to explain pictures, and look broken
+    from the side. Filled: they are a closed surface in completed colours, what is seen is kept flat on the mesh, and
+    alpha is compared with the matte. Auto: filled if one camera filmed, trained if there are several. Methods that bind
+    no Gaussians to triangles train all sides in either case."""
     mesh: Literal["tracked", "fitted", "auto"] = "auto"
-    """The mesh that Gaussians are bound to. Tracked: as tracking left it. Fitted: before training, what stands out
-    beyond the person's mattes, such as a skull above the hair or an ear that hangs too low, is drawn into them. Auto:
-    fitted where sides are filled (`--training.unseen`), where a fill would stand out like a cap or a grey lobe, else
-    tracked."""
+    """The mesh that Gaussians are bound to: as tracking left it (tracked), or drawn into the mattes where it is outside
+    of them (fitted). Auto: fitted where sides are filled (`--training.unseen`), else tracked."""
     side_weight: Annotated[float, NOT_NEGATIVE] = 0.1
     """Weight of the views from the side and of raised expressions, in which filled heads are compared with the
     completed mesh."""
     hair_rate: Annotated[float, Range(0, 0.01)] = 6e-4
-    """Largest distance in metres by which the surface of the hair of a filled head rises or sinks in one correction,
-    where that lowers the loss. There is one after every 8 steps from 3 to 60 % of the run, and they get smaller. 0
-    keeps the hair at the height that was measured on mattes or guessed from it."""
+    """Largest distance in metres by which the surface of the hair of a filled head moves in one correction. 0 keeps it
+    at the height that was measured on mattes or guessed from it."""
     inside: Literal["free", "covered", "filled"] = "covered"
-    """Eyeballs and the inside of the mouth. Free: their Gaussians may help to explain lids, lips and cheeks that hide
-    them, and are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in
-    each step, so that lids and lips become opaque. Filled: also, a mouth that is hardly ever seen gets a surface in
-    dark colours at half of the run, which can show as dark spots on cheeks from the side. Methods that bind no
-    Gaussians to triangles have no such Gaussians."""
+    """Eyeballs and the inside of the mouth. Free: they may help to explain lids, lips and cheeks that hide them, and
+    are missing where eyes and mouth open. Covered: where the mesh hides them, they have another colour in each step, so
+    that lids and lips become opaque. Filled: also, a mouth that is hardly ever seen gets a dark surface at half of the
+    run, which can show as dark spots on cheeks from the side."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
     coarse: Annotated[float, FRACTION] = 0.0
-    """Share of the run, from its start, that trains on pictures of half that size. Such steps take less time, and
-    details get a little softer. Pictures whose longer side has fewer than 384 pixels are not halved."""
+    """Share of the run, from its start, that trains on pictures of half that size, which takes less time. Pictures
+    whose longer side has fewer than 384 pixels are not halved."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
-    threads: Annotated[int, Range(0, 256)] = 0
-    """Number of threads of native operations. 0 means MIEN_THREADS or all cores. Results do not depend on it."""
     device: DeviceName = "cpu"
     """Device that training runs on. On `cuda` (through gsplat), the same seed does not give the same bytes."""
     checkpoint_every: Annotated[int, Range(1, 1_000_000_000)] = 1_000
@@ -132,6 +113,13 @@ def doubly_held_out(settings: TrainSettings) -> str | None:
         f"--split {settings.split} holds out a fifth of each other sequence as well, beside --hold-out "
         f"{' '.join(settings.held_out_sequences)}; add --split none to train on all of them"
     )
+
+
+def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
+    """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
+    if settings.background == "auto":
+        settings = replace(settings, background="mixed" if filled else "white")
+    return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
 
 
 @dataclass(frozen=True)
@@ -190,3 +178,28 @@ PRESETS = {
 }
 """Presets by name. `standard` is the defaults. `fine` takes twice as many steps. `paper` repeats the method's paper,
 and `paper-cpu` is the same in a size that a processor can train; not every method has them."""
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """Analysis by synthesis: a quick avatar is trained, and the face parameters of all frames are fitted to it."""
+
+    when: Literal["auto", "always", "never"] = "auto"
+    """Whether frames are aligned. Auto: if one camera filmed, the preset is not paper, and the run is not shorter than
+    the training of the quick avatar. Several cameras agree on the face already, and the papers train on the tracking
+    alone."""
+    template_steps: Annotated[int, COUNT] = 3_000
+    """Number of training steps of the quick avatar."""
+    template_gaussians: Annotated[int, COUNT] = 20_000
+    """Largest number of Gaussians of the quick avatar."""
+    resolution: Annotated[int, Range(16, MAX_SIDE)] = 256
+    """Longer side of the pictures, in pixels, for the quick avatar and for the alignment."""
+    iterations: Annotated[int, COUNT] = 8
+    """Number of optimiser steps for each frame."""
+    rate: Annotated[float, POSITIVE] = 7e-4
+    """How far a step turns a head whose gradient has the usual size, in radians. Its position moves by 0.3 of it, in
+    metres, joint angles by 3 times and expression coefficients by 10 times as much."""
+
+    def check(self) -> None:
+        """Check that all numbers are in their ranges."""
+        check_ranges(self, lambda name: f"--alignment.{name.replace('_', '-')}")

@@ -36,19 +36,9 @@ def strand_gaussians(
 ) -> dict[str, Tensor]:
     """Gaussians that look like strands, in the frames and units of their triangles. They are the same in every call.
 
-    Strands lie on the surface of the hair, point down and back, and differ in brightness. Their number is that of the
-    chosen triangles' area, evenly spread.
-
-    Args:
-        vertices: The neutral head in the head frame (y up, z ahead), in metres, on the CPU.
-        faces: Its triangles.
-        chosen: Triangles that get strands.
-        height: Height of the hair above each triangle, in metres.
-        colors: Colours of the triangles, 0..1.
-
-    Returns:
-        The tensors `face_index, means, quats, log_scales, opacity_logits, sh_constant` of a store, with one row for
-        each strand.
+    Strands lie on the surface of the hair, point down and back, and differ in brightness. They are evenly spread over
+    the chosen triangles of a neutral head in the head frame (y up, z ahead), in metres. Colours are 0..1. The result
+    has the tensors of a store, with one row for each strand.
     """
     vertices, random = vertices.detach(), torch.Generator().manual_seed(0)
     frames = triangle_frames(vertices, faces)
@@ -99,7 +89,6 @@ def _evenly_drawn(
 def _places(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], triangles: Int[Tensor, " n"], random: torch.Generator
 ) -> Float[Tensor, "n 3"]:
-    """A random point on each of the triangles."""
     share = torch.rand(len(triangles), 2, generator=random)
     share = torch.where(share.sum(1, keepdim=True) > 1, 1 - share, share)
     weights = torch.cat([1 - share.sum(1, keepdim=True), share], dim=1)
@@ -109,5 +98,4 @@ def _places(
 def _to_triangles(
     frames: TriangleFrames, triangles: Int[Tensor, " n"], vectors: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Vectors of the head frame in the axes of their triangles."""
     return torch.einsum("nji,nj->ni", frames.R[triangles], vectors)

@@ -1,8 +1,15 @@
-"""Random places on a mesh."""
+"""Points: random places on a mesh, and the positional encoding that the networks of several methods share."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+
+def positional_encoding(points: Float[Tensor, "*b 3"], bands: int) -> Float[Tensor, "*b c"]:
+    """Points, then sines and cosines of 1, 2, 4, ... times the points (NeRF, Mildenhall et al. 2020): 3 + 6 `bands`."""
+    angles = points[..., None, :] * 2.0 ** torch.arange(bands, dtype=points.dtype, device=points.device)[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-2)
+    return torch.cat([points, waves.flatten(-3)], dim=-1)
 
 
 @torch.no_grad()

@@ -1,14 +1,16 @@
-"""A gain of three numbers for each timestep, which is learned beside the avatar where the light changes.
+"""Colours that are learned beside the avatar and used only in training: of each camera, and of each timestep's light.
 
-A camera with automatic exposure makes a face brighter and darker over time. Without gains, the avatar has to explain
-this by poses and expressions, which blotches the skin. The avatar has the mean light of the frames that it is trained
+Cameras of a rig differ in exposure and white balance, and a camera with automatic exposure makes a face brighter and
+darker over time. Without transforms, the avatar has to explain this by colours that depend on the view, by fog in front
+of a camera, or by poses and expressions, which blotches the skin.
+
+Gains of timesteps are linear in time, in their logarithm, between knots at timesteps that are trained on. So the pixels
+of a held-out timestep decide nothing about its own gain. The avatar has the mean light of the frames that it is trained
 on. What is compared with a picture is the rendering times the gain of the picture's timestep.
-
-Gains are linear in time, in their logarithm, between knots at timesteps that are trained on. So the pixels of a
-held-out timestep decide nothing about its own gain.
 """
 
 from collections.abc import Sequence as Items
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,22 +18,96 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.adam import Moments
+from mien.avatar.avatar import ParameterGroup
+from mien.avatar.settings import Rate
 from mien.capture.quality import is_light_changing
-from mien.disk.files import read_tensors
+from mien.disk.files import expect_whole, read_tensors
 from mien.errors import UserError
 from mien.render.rendering import Rendering
-from mien.training.camera_colors import LearnedColors, recolored
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
-from mien.training.parts import TrainingPart
 from mien.training.settings import TrainSettings
+
+COLOR_RATE = 1e-3  # learning rate of the cameras' colours, and of gains, at the first step
+_LAST_SHARE = 0.1  # the same at the last step, as a share of that at the first
+
+
+class LearnedColors:
+    """Numbers of colours that are learned beside the avatar, with their own state of the optimiser."""
+
+    def __init__(self, name: str, values: Tensor):
+        self.values = values.detach().clone().requires_grad_()
+        self.name, self._rate = name, Rate(COLOR_RATE, _LAST_SHARE * COLOR_RATE)
+        self._moments = {"changes": Moments.zeros(values)}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """One group of all numbers."""
+        return [ParameterGroup(self.name, {"changes": self.values}, self._rate, {**self._moments})]
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a checkpoint has to save. They share memory with the numbers."""
+        moments = self._moments["changes"]
+        return {
+            "changes": self.values.detach(), "changes.first": moments.first, "changes.second": moments.second,
+            "changes.step": moments.step,
+        }  # fmt: skip
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        for name, own in self.state().items():
+            own.copy_(state[name])
+
+
+def recolored(rendering: Rendering, background: Float[Tensor, " 3"], change: Float[Tensor, "3 4"]) -> Rendering:
+    """The rendering with other colours: `change` adds a matrix times the colour, and an offset.
+
+    The background keeps its colour.
+    """
+    alpha = rendering.alpha[..., None]
+    foreground = rendering.image - (1 - alpha) * background
+    return replace(rendering, image=rendering.image + foreground @ change[:, :3].T + alpha * change[:, 3])
+
+
+class CameraColors:
+    """An affine map of colours for each camera id that is trained on. All start as the identity."""
+
+    def __init__(self, sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor):
+        trained = {(frame.sequence, frame.camera) for frame in frames}
+        ids = dict.fromkeys(sequences[index].capture.camera_ids[camera] for index, camera in sorted(trained))
+        if len(ids) < 2:
+            raise UserError(
+                f"--training.camera-colors {settings.camera_colors}: compares cameras, and this run trains on "
+                f"{', '.join(ids)} alone; leave the option out"
+            )
+        self._first_is_right = settings.camera_colors == "first"
+        self.ids = tuple(ids)
+        """The cameras, in the order of the maps."""
+        self.learned = LearnedColors("colors", like.new_zeros(len(ids), 3, 4))
+        places = {camera_id: place for place, camera_id in enumerate(ids)}
+        self._places = [[places.get(camera_id, 0) for camera_id in one.capture.camera_ids] for one in sequences]
+
+    def changes(self) -> Float[Tensor, "c 3 4"]:
+        """What each camera's map adds to a colour: a matrix, then an offset. That of the right one is zero."""
+        changes = self.learned.values
+        return changes - (changes[:1] if self._first_is_right else changes.mean(0, keepdim=True))
+
+    def seen_by(self, rendering: Rendering, background: Float[Tensor, " 3"], frame: Frame) -> Rendering:
+        """The rendering of a training frame in its camera's colours. The background keeps its colour."""
+        return recolored(rendering, background, self.changes()[self._places[frame.sequence][frame.camera]])
+
+
+def camera_colors(
+    sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
+) -> CameraColors | None:
+    """The colour transforms of a run, or None if its settings ask for none."""
+    return None if settings.camera_colors == "none" else CameraColors(sequences, frames, settings, like)
+
 
 _GAIN_INTERVAL = 0.1  # time in seconds between knots of the gains of timesteps. Automatic exposure takes longer
 
 GAINS = "gains.safetensors"
 """File of a run with the gains of all timesteps of all sequences. Runs in steady light have none."""
-_MOST = 100.0
-"""Largest gain that is read, and the inverse of the least."""
 
 
 class FrameGains:
@@ -39,15 +115,9 @@ class FrameGains:
 
     They start from the brightness of the faces that are trained on. Their logarithms have a mean of 0 over these. A
     sequence that is not trained on has gains of 1.
-
-    Args:
-        sequences: The sequences of a run.
-        frames: The frames that are trained on.
-        rate: Learning rate of the logarithms, per step.
-        like: The gains have its dtype and its device.
     """
 
-    def __init__(self, sequences: Items[Sequence], frames: Items[Frame], rate: float, like: Tensor):
+    def __init__(self, sequences: Items[Sequence], frames: Items[Frame], like: Tensor):
         lengths = [sequence.capture.timesteps for sequence in sequences]
         self._starts = [sum(lengths[:index]) for index in range(len(lengths))]
         used = [sorted({one.timestep for one in frames if one.sequence == index}) for index in range(len(lengths))]
@@ -72,7 +142,7 @@ class FrameGains:
         self._places, self._shares = torch.from_numpy(places).to(like.device), torch.from_numpy(shares).to(like)
         self._usual = torch.from_numpy(usual).to(like)
         self._trained = torch.from_numpy(shares.sum(1, keepdims=True)).to(like)
-        self.learned = LearnedColors("frame_gains", knots[:, None].repeat(1, 3), rate)
+        self.learned = LearnedColors("gains", knots[:, None].repeat(1, 3))
 
     def _at(self, index: int | slice) -> Float[Tensor, "n 3"]:
         """The logarithms of the gains of some timesteps."""
@@ -105,38 +175,22 @@ def light_changes(sequences: Items[Sequence], frames: Items[Frame]) -> bool:
     return is_light_changing(levels)
 
 
-def frame_gains_part(
+def frame_gains(
     sequences: Items[Sequence], frames: Items[Frame], settings: TrainSettings, like: Tensor
-) -> TrainingPart | None:
-    """The gains of a run as a part of its training, or None if the light is steady or the settings ask for none."""
+) -> FrameGains | None:
+    """The gains of a run, or None if the light is steady or the settings ask for none."""
     if settings.light == "steady" or (settings.light == "auto" and not light_changes(sequences, frames)):
         return None
-    gains = FrameGains(sequences, frames, settings.camera_color_rate, like)
-    return TrainingPart(
-        "gains",
-        seen=lambda rendering, one: gains.seen_by(rendering, one.target.background, one.frame),
-        parameter_groups=gains.learned.parameter_groups,
-        state=gains.learned.state,
-        load_state=gains.learned.load_state,
-        results=lambda: {GAINS: {"gains": gains.gains().detach()}},
-    )
+    return FrameGains(sequences, frames, like)
 
 
 def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]:
-    """The gains of each sequence of a finished run. The list is empty if it was trained without any.
-
-    Args:
-        run_dir: The run's folder.
-        lengths: Number of timesteps of each sequence.
-    """
+    """The gains of each sequence of a finished run. The list is empty if it was trained without any."""
     path = run_dir / GAINS
     if not path.exists() and not path.is_symlink():
         return []
-    gains = read_tensors(path).get("gains", torch.zeros(0))
-    is_whole = gains.shape == (sum(lengths), 3) and gains.dtype in (torch.float32, torch.float64)
-    if not is_whole or not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
-        raise UserError(f"{path}: does not hold gains of {sum(lengths)} timesteps; train again")
-    return list(gains.float().split(list(lengths)))
+    with expect_whole(path, "train again"):
+        return list(read_tensors(path)["gains"].float().split(list(lengths)))
 
 
 def _brightness(sequences: Items[Sequence], frames: Items[Frame], timesteps: int) -> Float[np.ndarray, " t"]:

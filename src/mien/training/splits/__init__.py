@@ -1,1 +1,0 @@
-"""Which frames are held out, beside the last ones: `named` sequences, a `benchmark`'s, or a dataset's `own`."""

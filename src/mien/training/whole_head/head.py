@@ -1,0 +1,181 @@
+"""What training does with Gaussians that are bound to a surface, beside fitting pictures: it makes heads whole.
+
+Sides that no picture shows are closed, hair moves, views from the side are compared with the completed mesh, and what
+is inside a head explains only what the mesh shows of it. The trainer calls a `WholeHead` at its times.
+"""
+
+from collections.abc import Callable
+from collections.abc import Sequence as Items
+from dataclasses import replace
+from typing import TypeVar
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mien.avatar.avatar import Avatar, Posed
+from mien.avatar.density import DensityControl
+from mien.avatar.settings import Photometric, Progress
+from mien.camera import Camera
+from mien.face.params import FaceParams
+from mien.render.rendering import Rendering
+from mien.training.footage.coverage import Coverage, measure_coverage
+from mien.training.footage.filmed import with_shown_angles
+from mien.training.footage.frames import COVER, SIDE_VIEW, BatchFrame, Footage, random_at
+from mien.training.footage.hidden import inside_triangles
+from mien.training.settings import TrainSettings
+from mien.training.whole_head.contribution import prune_hidden
+from mien.training.whole_head.hair_surface import HairSurface, hair_surface
+from mien.training.whole_head.mouth_interior import cover_hidden, fill_interior, interior_colors
+from mien.training.whole_head.side_views import SideView, SideViews, side_views_of
+from mien.training.whole_head.unseen import Unseen, fills_sides, spare_fills, unseen_of
+
+HAIR_EVERY = 8  # number of training frames from one correction of the hair's surface to the next
+_Made = TypeVar("_Made")
+
+
+class WholeHead:
+    """What no training picture shows of a head, what is inside of it, and what is done about both."""
+
+    name = "hair"
+    """Prefix of its tensors in checkpoints."""
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        unseen: Unseen | None,
+        settings: TrainSettings,
+        interior: Float[Tensor, "f 3"] | None,
+        coverage: Coverage | None,
+    ):
+        """Take what the pictures show, and the colours of a mouth that is filled, on the device of the avatar.
+
+        `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled.
+        """
+        surface = avatar.surface()
+        assert surface is not None
+        self.unseen, self.coverage = unseen, coverage
+        self.fills = unseen is not None and unseen.fills
+        self.side_views: SideViews | None = side_views_of(avatar.face_model, unseen, settings.side_weight)
+        self.hair: HairSurface | None = None
+        if unseen is not None and unseen.fills:
+            self.hair = hair_surface(avatar, unseen.prior)
+        self.hideable = None if settings.inside == "free" else inside_triangles(avatar.face_model)
+        """Triangles of which targets say whether the mesh hides them, on the CPU. None if nothing asks."""
+        self._next_view: Callable[[], SideView] | None = None
+        """Returns the side view of the step that runs. None if it has none."""
+        self._avatar, self._surface, self._settings, self._interior = avatar, surface, settings, interior
+
+    @property
+    def rare_losses(self) -> tuple[str, ...]:
+        """Names of losses that not every step has."""
+        return () if self.side_views is None else ("side_views",)
+
+    def density(self, control: DensityControl) -> DensityControl:
+        """The avatar's density control, which spares what is closed."""
+        return control if self.unseen is None else spare_fills(self._surface, control, self.unseen)
+
+    def weights(self, weights: Photometric) -> Photometric:
+        """The weights of the losses that compare pictures."""
+        return weights if self.unseen is None else self.unseen.weights(weights)
+
+    def before_step(
+        self, batch: Items[BatchFrame], meanwhile: Callable[[Callable[[], _Made]], Callable[[], _Made]]
+    ) -> None:
+        """Fill the mouth if it is due, and begin a side view if one of the frames is due for it.
+
+        `meanwhile` lets another thread call a function, and returns what waits for its result.
+        """
+        for one in batch if self._interior is not None else ():
+            fill_interior(self._surface, self._avatar.face_model, self._interior, one.number, self._settings.steps)
+        side_views, self._next_view = self.side_views, None
+        due = [] if side_views is None else [one for one in batch if side_views.due(one.number)]
+        if side_views is not None and due:
+            one = due[0]
+            random = random_at(self._settings.seed, SIDE_VIEW, one.number)
+            self._next_view = meanwhile(side_views.drawn(one.face, one.camera, one.number, random))
+
+    def posed(self, posed: Posed, one: BatchFrame) -> Posed:
+        """The Gaussians of a frame, of which those that the mesh hides have a colour drawn at random."""
+        if self.hideable is None:
+            return posed
+        return cover_hidden(posed, self._surface, one.target.hidden, random_at(self._settings.seed, COVER, one.number))
+
+    def losses(self, progress: Progress) -> dict[str, Float[Tensor, ""]]:
+        """The loss of the side view, if the step has one."""
+        side_views, view = self.side_views, self._next_view
+        if side_views is None or view is None:
+            return {}
+        self._next_view = None
+        return {"side_views": side_views.loss(self._avatar, view(), progress)}
+
+    def after_backward(self, progress: Progress, renderings: Items[Rendering]) -> None:
+        """Collect the gradients that move hair, and take those of what is made up."""
+        if self.hair is not None:
+            self.hair.collect(self._surface, progress.fraction)
+        if self.unseen is not None:
+            self.unseen.mask_gradients(self._avatar, self._surface, *renderings)
+
+    def after_update(self) -> None:
+        """Bring Gaussians back to the surface."""
+        if self.unseen is not None:
+            self._surface.keep_to(self.unseen.prior)
+
+    def move_hair(self, progress: Progress) -> None:
+        """Correct the height of hair if it is due after a step."""
+        hair = self.hair if progress.reaches(HAIR_EVERY) else None
+        if hair and hair.correct(self._surface, progress.done / progress.steps, self._settings.hair_rate):
+            self._follow_hair()
+
+    def redundant(self, views: Items[tuple[FaceParams, Camera]], *, last: bool) -> Bool[Tensor, " n"]:
+        """The Gaussians that hardly add to any of the views. `last` says that no step follows."""
+        assert self.unseen is not None
+        return prune_hidden(self._avatar, self._surface, self.unseen, views, close=not last)
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors that a checkpoint has to save."""
+        return {} if self.hair is None else self.hair.state
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        if self.hair is not None:
+            self.hair.load_state(state)
+            self._follow_hair()
+
+    def _follow_hair(self) -> None:
+        if self.hair is None or self.unseen is None:
+            return
+        prior = self.hair.prior()
+        self.unseen = replace(self.unseen, prior=prior)
+        if self.side_views is not None:
+            self.side_views = self.side_views.at_height(prior.fill_height)
+
+
+def prepare_whole_head(
+    avatar: Avatar, footage: Footage, settings: TrainSettings
+) -> Callable[[Tensor], WholeHead] | None:
+    """Look at the training pictures, and close the avatar's surface where none shows it, if it is asked for.
+
+    Returns a function that makes the whole head on the device of a tensor, once the avatar is there. It is None for
+    avatars whose Gaussians are bound to no surface.
+    """
+    surface, model = avatar.surface(), avatar.face_model
+    if surface is None:
+        return None
+    filled, unseen, coverage, interior = fills_sides(footage.frames, settings, bound=True), None, None, None
+    if filled or surface.limited:
+        unseen = unseen_of(avatar, footage, filled=filled)
+        surface.close(unseen.prior)
+        coverage = unseen.coverage
+    if filled and coverage is not None:
+        neutral = model.head_vertices(avatar.subject)[0].detach()
+        assert avatar.filmed is not None
+        avatar.filmed = with_shown_angles(avatar.filmed, model, neutral, coverage)
+    if settings.inside == "filled":
+        coverage = coverage or measure_coverage(footage)
+        interior = interior_colors(avatar, coverage)
+
+    def make(like: Tensor) -> WholeHead:
+        own = None if unseen is None else unseen.to(like)
+        return WholeHead(avatar, own, settings, None if interior is None else interior.to(like), coverage)
+
+    return make
