@@ -27,7 +27,6 @@ MAY_NAME = {
     "src/mien/lab/analysis/registry.py": "the list of analyses, one for the paper of each method",
     "src/mien/lab/benchmarking/registry.py": "the list of benchmarks of training steps",
     "src/mien/lab/benchmarking/train_step.py": "measures the step of one method",
-    "src/mien/lab/benchmarking/device.py": "measures the step of one method on a GPU",
     "src/mien/lab/benchmarking/headgas_step.py": "measures the step of one method",
     "src/mien/lab/benchmarking/mono_step.py": "measures the step of one method",
     "src/mien/formats/registry.py": "the list of formats; one is named after the program whose files it reads",

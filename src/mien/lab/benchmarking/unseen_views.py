@@ -14,7 +14,6 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.disk.files import write_atomically
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
@@ -23,6 +22,7 @@ from mien.lab.synthetic.truth import Truth
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
 from mien.media.pictures import Box
+from mien.pages.plots import Axes, Series, write_chart
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
 from mien.tracking.neck_cut import NeckParts
@@ -237,22 +237,19 @@ def _by_angle(rows: list[tuple[_View, dict[str, Scores]]]) -> Figures:
 
 
 def write_unseen_chart(path: Path, figures: Figures) -> None:
-    """Write a chart of the head crop's PSNR over the angle aside. The file's ending decides its format."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
-    axes = figure.subplots()
-    for subject, style in ((AVATAR, "o-"), (MESH, "s--")):
-        level = {0.0 if label == "front" else float(label): row for label, row in figures.items() if _is_level(label)}
-        axes.plot(list(level), [row[subject]["head"]["psnr"] for row in level.values()], style, label=subject)
-    axes.set(xlabel="degrees from the front camera", ylabel="PSNR of the head crop, dB", title="unseen views")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    write_atomically(path, lambda part: figure.savefig(part, format=path.suffix.lstrip("."), dpi=130))
-
-
-def _is_level(label: str) -> bool:
-    return label == "front" or label.isdigit()
+    """Write a .svg of the head crop's PSNR over the angle to the side."""
+    level = {
+        0 if label == "front" else int(label): row
+        for label, row in figures.items()
+        if label.isdigit() or label == "front"
+    }
+    angles = np.array(list(level), np.float64)
+    series = [
+        Series(subject, angles, np.array([row[subject]["head"]["psnr"] for row in level.values()]), style)
+        for subject, style in ((AVATAR, "main"), (MESH, "second"))
+    ]
+    axes = Axes("degrees from the front camera", "dB")
+    write_chart(path, [("Unseen views: PSNR of the head crop, dB", series, axes)])
 
 
 def _judged(moments: int, count: int) -> set[int]:
