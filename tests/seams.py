@@ -25,7 +25,7 @@ MAY_NAME = {
     "src/mien/avatar/methods.py": "the list of methods",
     "src/mien/avatar/point_avatar/avatar.py": "uses the deformation network that its successor took over",
     "src/mien/lab/analysis/registry.py": "the list of analyses, one for the paper of each method",
-    "src/mien/lab/benchmarking/registry.py": "the list of benchmarks of training steps",
+    "src/mien/lab/benchmarking/__init__.py": "the list of benchmarks of training steps",
     "src/mien/lab/benchmarking/train_step.py": "measures the step of one method",
     "src/mien/lab/benchmarking/headgas_step.py": "measures the step of one method",
     "src/mien/lab/benchmarking/mono_step.py": "measures the step of one method",

@@ -25,7 +25,7 @@ from mien.driving.motion import ARKIT_NAMES
 from mien.evaluation import living
 from mien.evaluation.living import Living
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.lab.benchmarking.quality import unseen_lines
+from mien.lab.benchmarking.quality import unseen_table
 from mien.lab.benchmarking.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
 from mien.lab.synthetic.recipe import SIDES
 from mien.lab.synthetic.references import REFERENCES
@@ -338,9 +338,9 @@ def test_table_and_chart(tmp_path) -> None:  # noqa: ANN001
     figures = {"psnr": 20.0, "ssim": 0.5, "l1": 0.1, "perceptual": 0.25}
     unknown = {**figures, "head": {**figures, "perceptual": None}}
     rows = {name: {"avatar": {**figures, "head": figures}, "mesh": unknown} for name in names}
-    assert unseen_lines("mono-sides", rows)[3] == "| 15 | 20.00 / 0.500 / 0.250 | 20.00 / 0.500 / - |"
-    write_unseen_chart(tmp_path / "chart.png", rows)
-    assert (tmp_path / "chart.png").stat().st_size > 1000
+    assert unseen_table("mono-sides", rows).splitlines()[3] == "| 15 | 20.00 / 0.500 / 0.250 | 20.00 / 0.500 / - |"
+    write_unseen_chart(tmp_path / "chart.svg", rows)
+    assert (tmp_path / "chart.svg").stat().st_size > 1000
     assert REFERENCES["ring-16"].views is None
 
 

@@ -13,7 +13,7 @@ from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.commands.parsing.options import PresetName, check_method, listed_methods
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
-from mien.lab.benchmarking.registry import GPU_BENCHMARKS, STEP_BENCHMARKS
+from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
 from mien.machine.terminal import show
 from mien.plugins import named

@@ -1,11 +1,9 @@
 """Rows and tables of `mien bench compare`: several methods on the same frames, with the same budget."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
-
-from mien.lab.benchmarking.tables import markdown
 
 _QUALITY: tuple[tuple[str, str, int, bool], ...] = (
     ("head.psnr", "head: PSNR, dB", 2, True),
@@ -132,3 +130,10 @@ def _lines(
         first = (capture, protocol.replace("_", " ")) if index == 0 else ("", "")
         lines.append((*first, method, *cells))
     return lines
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in markdown. Each line ends with a line break."""
+    lines = [" | ".join(heads), *(" | ".join(row) for row in rows)]
+    lines = [f"| {line} |" for line in lines]
+    return "\n".join([lines[0], "|" + "---|" * len(heads), *lines[1:]]) + "\n"

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
+from mien.lab.benchmarking.comparing import markdown
 from mien.lab.benchmarking.following import (
     Following,
     blink_following,
@@ -17,7 +18,6 @@ from mien.lab.benchmarking.following import (
     still_timesteps,
     turn_following,
 )
-from mien.lab.benchmarking.tables import markdown
 from mien.lab.synthetic.truth import Truth
 from mien.machine import exact
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
@@ -180,7 +180,7 @@ def markdown_table(rows: list[QualityRow]) -> str:
     ]  # fmt: skip
     for row in rows:
         views = {row.capture: row.unseen_views, f"{row.capture}, true tracking": row.unseen_views_by_truth}
-        tables += [_unseen_table(name, figures) for name, figures in views.items() if figures]
+        tables += [unseen_table(name, figures) for name, figures in views.items() if figures]
     seconds = [", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items()) for row in rows]
     spent = [
         (row.capture, f"{row.steps:,}", f"{row.gaussians:,}", told) for row, told in zip(rows, seconds, strict=True)
@@ -189,7 +189,7 @@ def markdown_table(rows: list[QualityRow]) -> str:
     return "\n".join(tables)
 
 
-def _unseen_table(name: str, views: dict[str, Any]) -> str:
+def unseen_table(name: str, views: dict[str, Any]) -> str:
     """A table of the head crop by angle."""
     heads = [
         f"{name}: degrees to the side", "avatar: PSNR / SSIM / ST-LPIPS of the head crop", "mesh in completed colours"

@@ -53,13 +53,11 @@ class ReferenceCapture:
         scenes: list[SyntheticScene] = []
         for index, recipe in enumerate(self.sequences):
             scenes.append(SyntheticScene(recipe, self.seed, 1000 * self.seed + index, scenes[0] if scenes else None))
-        views = self.views
-        for recipe in self.sequences if views is not None else ():
-            if views is not None and recipe.name == views.sequence:
-                seen = replace(recipe, name=views.name, cameras="sides")
-                moments = range(views.first, recipe.timesteps, views.every)
-                of = scenes[self.sequences.index(recipe)]
-                scenes.append(SyntheticScene(seen, self.seed, of.motion_seed, scenes[0], moments))
+        for of in [scene for scene in scenes if self.views and scene.recipe.name == self.views.sequence]:
+            assert self.views is not None
+            seen = replace(of.recipe, name=self.views.name, cameras="sides")
+            moments = range(self.views.first, of.recipe.timesteps, self.views.every)
+            scenes.append(SyntheticScene(seen, self.seed, of.motion_seed, scenes[0], moments))
         return scenes
 
     def write(self, folder: Path) -> str:

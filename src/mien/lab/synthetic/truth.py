@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien.disk.files import read_arrays, read_json, write_arrays, write_json
-from mien.errors import UserError
-from mien.lab.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure_anatomy
+from mien.disk.files import expect_whole, read_arrays, read_json, write_arrays, write_json
+from mien.lab.synthetic.anatomy import CHIN, EAR, FOREHEAD_TOP, Anatomy, measure_anatomy
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.machine import exact
 from mien.tracking.files import read_tracking, write_tracking
@@ -20,9 +19,6 @@ FORMAT, VERSION = "mien.synthetic_truth", 1
 _JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"
 _METER, _PIXEL = 1e-5, 1 / 16
 """Units of the stored 16-bit numbers: 10 micrometres, a sixteenth of a pixel."""
-_MAX_STORED = np.iinfo(np.int16).max
-_REMEDY = "delete the folder and draw the capture again"
-_EAR = 234
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +63,7 @@ def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
     skin = np.unique(anatomy.faces[anatomy.skin & ~anatomy.region("ears", "neck", "scalp")])
     points, marks = anatomy.vertices[skin], anatomy.landmarks
     inside = (points[:, 1] > marks[CHIN, 1] - 0.005) & (points[:, 1] < marks[FOREHEAD_TOP, 1])
-    return skin[inside & (points[:, 2] > marks[_EAR, 2])].astype(np.int64)
+    return skin[inside & (points[:, 2] > marks[EAR, 2])].astype(np.int64)
 
 
 def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
@@ -86,27 +82,24 @@ def write_truth(folder: Path, truth: Truth) -> None:
         "landmarks": _packed(truth.landmarks, _PIXEL),
     }
     write_arrays(folder / _ARRAYS, arrays)
-    content = {"metre": _METER, "pixel": _PIXEL}
-    write_json(folder / _JSON, FORMAT, VERSION, content)
+    write_json(folder / _JSON, FORMAT, VERSION, {"metre": _METER, "pixel": _PIXEL})
 
 
 def read_truth(folder: Path) -> Truth:
     """Read what `write_truth` wrote."""
     content = read_json(folder / _JSON, FORMAT, VERSION)
     arrays = read_arrays(folder / _ARRAYS)
-    try:
+    with expect_whole(folder / _JSON, "delete the folder and draw the capture again"):
         return Truth(
             tracking=read_tracking(folder / _TRACKING),
             vertex_index=arrays["vertex_index"].astype(np.int64),
-            vertices=_unpacked(arrays["vertices"], float(content["metre"])),
-            landmarks=_unpacked(arrays["landmarks"], float(content["pixel"])),
+            vertices=_unpacked(arrays["vertices"], content["metre"]),
+            landmarks=_unpacked(arrays["landmarks"], content["pixel"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{folder / _JSON}: incomplete ({error}); {_REMEDY}") from None
 
 
 def _packed(values: np.ndarray, unit: float) -> np.ndarray:
-    return np.clip(np.rint(values / unit), -_MAX_STORED, _MAX_STORED).astype(np.int16)
+    return np.clip(np.rint(values / unit), -32767, 32767).astype(np.int16)
 
 
 def _unpacked(values: np.ndarray, unit: float) -> np.ndarray:

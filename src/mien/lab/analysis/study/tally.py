@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.special import stdtrit
 
 from mien.lab.analysis.study.files import QUESTIONS, Answers, StudyKey
-from mien.lab.benchmarking.tables import markdown
+from mien.lab.benchmarking.comparing import markdown
 
 CONFIDENCE = 0.95
 """Share of the intervals that hold the true percentage, over many studies."""
