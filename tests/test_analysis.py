@@ -244,22 +244,10 @@ def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.Monk
     assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", "W", "--run", "toy", "--parts", "scale")
 
 
-def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    expected, path = analyze(workspace, "--parts", "growth"), workspace / "analysis/toy/analysis.json"
-    whole = path.read_bytes()
-    edit_json(path, lambda content: content.update(paper={"2": []}, run=3))
-    again = analyze(workspace, "--parts", "growth")
-    assert [again[name] for name in ("run", "paper", "parts")] == [expected[name] for name in ("run", "paper", "parts")]
-    capsys.readouterr()
-    for change in (
-        lambda content: content["parts"]["growth"]["tables"].append(3),
-        lambda content: content["parts"]["growth"]["charts"][0].update(file="../../a.png"),
-        lambda content: content.update(parts=3),
-    ):
-        path.write_bytes(whole)
-        edit_json(path, change)
-        assert main(["analyze", "gaussian-avatars", str(workspace), "--parts", "growth"]) == 2
-        assert "analysis" in capsys.readouterr().err.splitlines()[-1]
+def test_a_damaged_record_is_told_and_links_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    analyze(workspace, "--parts", "growth")
+    edit_json(workspace / "analysis/toy/analysis.json", lambda content: content.update(parts=3))
+    assert "analysis.json: incomplete or damaged" in complaint(capsys, "analyze", str(workspace), "--parts", "growth")
     shutil.rmtree(workspace / "analysis")
     (workspace / "analysis").symlink_to(workspace.parent)
     assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))

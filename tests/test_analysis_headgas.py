@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -20,7 +19,7 @@ from mien.gaussians import Gaussians
 from mien.lab.analysis import headgas
 from mien.lab.analysis.context import Context
 from mien.lab.analysis.headgas import Trained, busy_face, start_of_bases, trained_range, with_expression
-from mien.lab.analysis.measuring import head_camera, labeled, mouth_camera
+from mien.lab.analysis.measuring import head_camera, mouth_camera
 from mien.lab.analysis.registry import AnalysisOptions
 from mien.media.video import count_frames
 from mien.runtime.filmed import head_angles
@@ -165,17 +164,9 @@ def test_the_camera_goes_where_the_head_sees_it_at_an_angle(context: Context) ->
     shown = [math.degrees(yaw) for yaw in headgas.shown_yaws(Trained(trained.highest, (-0.5, 0.25), 0.0))]
     low, high = math.degrees(-0.5), math.degrees(0.25)
     assert shown == pytest.approx([low - 30, low - 15, low, (low + high) / 2, high, high + 15, high + 30])
-    # Views hold the head.
+    # A view of the head holds it. A face model without regions of a mouth gives the whole head.
     model, face = toy_face_model(), toy_face(5)[0]
     camera = head_camera(model, face, toy_camera(64), 100)
     pixels, _ = camera.project(model(face)[0])
-    assert (camera.width, camera.height) == (100, 100)
-    assert float(pixels.min()) > 0
-    assert float(pixels.max()) < 100
-    assert float((pixels.amax(0) - pixels.amin(0)).max()) > 70
-    # A face model without regions of a mouth gives the whole head.
+    assert 0 < float(pixels.min()) < float(pixels.max()) < 100
     assert mouth_camera(model, face, toy_camera(64), 50).K[0, 0] < 0.6 * camera.K[0, 0]
-    picture = labeled(np.full((10, 40, 3), 128, np.uint8), "text")
-    assert picture.shape == (30, 40, 3)
-    assert (picture[20:] == 128).all()
-    assert picture[:20].min() < 200

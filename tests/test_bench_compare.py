@@ -310,10 +310,6 @@ def test_delay_and_height_are_found_in_coefficients_and_in_turns():
     assert found.lag_frames == pytest.approx(1.5, abs=0.1)
     assert found.loss_percent == pytest.approx(10, abs=2)
     assert following.turn_following(exact_of(turns())[0], exact_of(0 * turns())[1], FPS) is None
-    # A mean rotation is in the middle.
-    vectors = torch.tensor([[0.0, 0.3, 0.0], [0.0, -0.1, 0.0]])
-    middle = axis_angle_from_matrix(following.mean_rotation(matrix_from_axis_angle(vectors)))
-    torch.testing.assert_close(middle, torch.tensor([0.0, 0.1, 0.0]).double(), atol=1e-6, rtol=0)
 
 
 def exact_of(rotations: torch.Tensor) -> tuple[Tracking, Truth]:

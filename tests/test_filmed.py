@@ -38,6 +38,7 @@ from mien.runtime.baked import Filmed
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
 from mien.training.footage.filmed import FILE, read_coverage
 from plain_settings import plain_config
+from reference_signatures import tiny
 from refusals import complaint, refuses
 from shared_things import toy_workspace, write_toy_workspace
 from small_face_model import make_small_face_model
@@ -294,7 +295,7 @@ def test_views_begin_at_the_tracked_camera_and_show_moments_of_the_held_out_sequ
     # The side views are those timesteps of the sequence, in the front camera as well, and no one else's.
     reference = REFERENCES["mono-sides"]
     assert known(reference.views).sequence in reference.held_out_sequences
-    front, aside, views = reference.tiny().scenes()
+    front, aside, views = tiny(reference).scenes()
     for index, timestep in enumerate(known(views.moments)):
         torch.testing.assert_close(views.vertices(index), aside.vertices(timestep))
     assert not torch.equal(front.vertices(0), aside.vertices(0))

@@ -16,7 +16,7 @@ import train_toy
 from known import known
 from mien.avatar.methods import METHODS
 from mien.cli import main
-from mien.lab.analysis.study.files import QUESTIONS, StudySettings, read_all_answers, read_key, shuffled
+from mien.lab.analysis.study.files import QUESTIONS, read_all_answers, read_key, shuffled
 from mien.lab.analysis.study.making import encode, spans
 from mien.media.video import read_video_frames
 from mien.training import read_sequence, train
@@ -290,9 +290,3 @@ def test_a_participant_answers_in_a_browser_under_a_name_of_their_own(page: Path
     name = 'document.getElementById("participant").textContent'
     first, other = (browse(page, [START, name])["results"][1] for _ in range(2))
     assert first != other
-
-
-def test_defaults_are_the_paper_s() -> None:
-    settings = StudySettings()
-    settings.check()
-    assert settings.clips == 10

@@ -99,14 +99,8 @@ class Context(Run):
     ) -> Run:
         """Train the run's sequences again for `options.steps` steps, with something changed.
 
-        A stopped training continues, and a finished one is only read.
-
-        Args:
-            name: Begins the name of the short training's folder.
-            config: The method's settings.
-            face_model: A face model with the vertices of the run's; None for that one.
-            resolution: Longer side of the training pictures, in pixels; None for that of the run.
-            timesteps: Which timesteps of each sequence may be trained on; None for all.
+        A stopped training continues, and a finished one is only read. `resolution` is the longer side of the training
+        pictures, in pixels, and `timesteps` are those of each sequence that may be trained on; None is all.
         """
         model = face_model or self.avatar.face_model
         settings = replace(self.settings, steps=self.options.steps, checkpoint_every=250)

@@ -111,10 +111,11 @@ def _growth_charts(steps: np.ndarray, gaussians: np.ndarray, times: np.ndarray, 
     # A few late steps would flatten the rest.
     single = np.minimum(times, np.percentile(times, 99))
     windows = [part for part in np.array_split(np.arange(len(steps)), 60) if len(part)]
-    middle = [
+    middle = Series(
+        "median",
         np.array([steps[part].mean() for part in windows]),
         np.array([np.median(times[part]) for part in windows]),
-    ]
+    )
     x, y = binned(gaussians, times)
     start = max(float(gaussians[0]), 1)
     line = np.array([1.0, max(10.0, float(gaussians.max()) / start)])
@@ -128,7 +129,7 @@ def _growth_charts(steps: np.ndarray, gaussians: np.ndarray, times: np.ndarray, 
         Chart(
             "growth-step-time",
             "Fig. 3b: time of a step, ms",
-            [Series("single steps", steps, single, "quiet"), Series("median", *middle)],
+            [Series("single steps", steps, single, "quiet"), middle],
             Axes("step", "ms", from_zero=True),
         ),
         Chart(

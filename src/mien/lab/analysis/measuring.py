@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -37,23 +36,15 @@ METRICS = ("head_psnr", "head_ssim", "head_perceptual")
 def measure_drawing(
     avatar: Avatar, camera: Camera, seconds: float, face: FaceParams | None = None
 ) -> dict[str, float | int]:
-    """Draw the avatar over white, at all threads, for about `seconds`.
+    """Draw the avatar at a timestep (None: the person at rest) over white, at all threads, for about `seconds`.
 
     The first picture warms up and does not count, unless it alone takes longer than `seconds`.
 
-    Args:
-        avatar: The avatar.
-        camera: The camera, with the size of the picture.
-        seconds: Time to spend.
-        face: The timestep to pose, or None for the person at rest.
-
     Returns:
         width, height: Size of the picture in pixels.
-        gaussians, threads: Their numbers.
+        gaussians, threads, pictures: Their numbers; pictures that are timed.
         draw_ms, pose_ms: Medians of drawing and of posing, in milliseconds.
-        pictures: Number of timed pictures.
-        peak_mb: The process's largest memory while drawing, in MiB.
-        before_mb: Its memory before the first picture.
+        peak_mb, before_mb: The process's largest memory while drawing, and its memory before, in MiB.
     """
     before = _restart_peak()
     white = torch.ones(3)
@@ -162,14 +153,9 @@ def head_picture(experiment: Experiment, frame: Frame, image: Tensor) -> UInt8[n
 
 
 def zoomed(camera: Camera, box: Box, side: int) -> Camera:
-    """A part of the camera's view as a square picture of `side` pixels."""
+    """A square part of the camera's view as a picture of `side` pixels."""
     left, top, width, height = box
-    K = camera.K.clone()
-    K[0, 2] -= left + width / 2
-    K[1, 2] -= top + height / 2
-    K[:2] *= side / max(width, height)
-    K[:2, 2] += side / 2
-    return replace(camera, K=K, width=side, height=side)
+    return camera.cropped(left, top, width, height).resized(side, side)
 
 
 def mouth_box(model: FaceModel, face: FaceParams, camera: Camera) -> Box:

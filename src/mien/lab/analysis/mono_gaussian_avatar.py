@@ -109,7 +109,8 @@ def convergence(context: Context) -> Result:
     steps = sorted({max(1, round(share * context.options.steps)) for share in (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)})
     rows, tiles = [], [labeled(head_picture(experiment, frames[0], targets[0]), "truth")]
     for reached, gaussians, pictures in _snapshots(context, experiment, frames, steps):
-        scores = [psnr(*pair, experiment.crop(frame)) for *pair, frame in zip(pictures, targets, frames, strict=True)]
+        drawn_and_true = zip(pictures, targets, frames, strict=True)
+        scores = [psnr(picture, target, experiment.crop(frame)) for picture, target, frame in drawn_and_true]
         rows.append({"step": reached, "gaussians": gaussians, "head_psnr": round(float(np.mean(scores)), 3)})
         tiles.append(labeled(head_picture(experiment, frames[0], pictures[0]), f"step {reached}"))
     x, y, counts = (np.array([row[name] for row in rows], float) for name in ("step", "head_psnr", "gaussians"))

@@ -36,14 +36,6 @@ def run_analysis(
     """Run some parts of an analysis on a finished run, and return the content of analysis.json.
 
     A part that was computed before, for the same avatar and options, is kept. Each part is written once it is done.
-
-    Args:
-        analysis: The analysis of the run's method.
-        parts: The parts to run.
-        run_dir: The run.
-        sequence_dirs: The folders of the run's sequences, in its order.
-        folder: The folder to write into.
-        options: Steps and seconds.
     """
     options.check()
     check_method(analysis, run_dir)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from mien.lab.synthetic.truth import Truth
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.landmarks.groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.tracking import Tracking
@@ -125,10 +125,8 @@ def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | 
 
 def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor, "3 3"]:
     """Return the rotation nearest to the mean of the matrices."""
-    u, _, vh = torch.linalg.svd(rotations.double().mean(0))
-    sign = torch.ones(3, dtype=torch.float64)
-    sign[2] = torch.det(u @ vh)
-    return u @ torch.diag(sign) @ vh
+    nearest, _ = align_centered(np.eye(3), rotations.double().mean(0).T.numpy())
+    return torch.from_numpy(nearest)
 
 
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:

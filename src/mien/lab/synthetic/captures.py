@@ -23,7 +23,7 @@ from mien.errors import UserError
 from mien.face.loading import face_model_edition
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticFrame, SyntheticScene
-from mien.lab.synthetic.truth import hash_surface, truth_of, write_truth
+from mien.lab.synthetic.truth import Truth, truth_of, write_truth
 from mien.machine.progress import progress_bar, say, track_progress
 from mien.media.video import write_video
 from mien.tracking.tracking import Tracking
@@ -135,14 +135,15 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
             store.write(timestep, frames)
             advance()
     images, mattes = store.maps()
-    content_hash = _hash_content(scene, images, mattes)
+    truth = truth_of(scene)
+    content_hash = _hash_content(scene, images, mattes, truth)
     if recipe.cameras == "front":
         write_video(folder / VIDEO_NAME, (frame[0] for frame in images), recipe.fps, recipe.detail.compression)
     else:
         landmarks = np.stack(list(_detect_landmarks(scene, images)), axis=1)
         source = {**scene.source, "key": scene_key(scene), "drawn_hash": content_hash}
         write_capture(folder / CAPTURE_NAME, _make_capture(scene, images, mattes, landmarks, source, scene.cameras))
-    write_truth(folder / TRUTH_NAME, truth_of(scene))
+    write_truth(folder / TRUTH_NAME, truth)
     content = {
         "key": scene_key(scene),
         "content_hash": content_hash,
@@ -158,13 +159,14 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     return content_hash
 
 
-def _hash_content(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray) -> str:
+def _hash_content(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, truth: Truth) -> str:
     """A hash of all pictures, mattes and the truth. Another processor may draw a pixel one grey level differently."""
     digest = hashlib.sha256(repr((scene.timesteps, scene.recipe.camera_ids)).encode())
     for timestep in range(scene.timesteps):
         digest.update(images[timestep].tobytes())
         digest.update(mattes[timestep].tobytes())
-    hash_surface(digest, scene)
+    for array in truth.stored.values():
+        digest.update(array.tobytes())
     return digest.hexdigest()[:16]
 
 

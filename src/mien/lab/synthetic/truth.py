@@ -1,6 +1,5 @@
 """The exact truth of a synthetic capture, for measuring trackers in millimetres and pixels."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,21 +40,24 @@ class Truth:
         poses = self.tracking.face.T_world_head.numpy()
         return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
 
+    @property
+    def stored(self) -> dict[str, np.ndarray]:
+        """The arrays as they are stored."""
+        return {
+            "vertex_index": self.vertex_index.astype(np.int32),
+            "vertices": _packed(self.vertices, _METER),
+            "landmarks": _packed(self.landmarks, _PIXEL),
+        }
+
 
 def truth_of(scene: SyntheticScene) -> Truth:
     """Return the truth of a scene, rounded as it is stored."""
-    return Truth(scene.tracking(), *surface_of(scene))
-
-
-def surface_of(
-    scene: SyntheticScene,
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
-    """Return `vertex_index`, `vertices` and `landmarks` of the truth."""
     index = face_region(measure_anatomy(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
-    return index, _unpacked(_packed(vertices, _METER), _METER), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
+    rounded = (_unpacked(_packed(values, unit), unit) for values, unit in ((vertices, _METER), (landmarks, _PIXEL)))
+    return Truth(scene.tracking(), index, *rounded)
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
@@ -66,22 +68,10 @@ def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
     return skin[inside & (points[:, 2] > marks[EAR, 2])].astype(np.int64)
 
 
-def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
-    """Add the numbers of `surface_of` to a hash."""
-    index, vertices, landmarks = surface_of(scene)
-    digest.update(index.astype(np.int32).tobytes())
-    digest.update(_packed(vertices, _METER).tobytes() + _packed(landmarks, _PIXEL).tobytes())
-
-
 def write_truth(folder: Path, truth: Truth) -> None:
     """Write FOLDER/truth.json, truth.safetensors and tracking/. The json comes last."""
     write_tracking(folder / _TRACKING, truth.tracking)
-    arrays = {
-        "vertex_index": truth.vertex_index.astype(np.int32),
-        "vertices": _packed(truth.vertices, _METER),
-        "landmarks": _packed(truth.landmarks, _PIXEL),
-    }
-    write_arrays(folder / _ARRAYS, arrays)
+    write_arrays(folder / _ARRAYS, truth.stored)
     write_json(folder / _JSON, FORMAT, VERSION, {"metre": _METER, "pixel": _PIXEL})
 
 
