@@ -7,6 +7,7 @@ last bit differently. So a capture is identified by its key, and the signature c
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from jaxtyping import Float
 
 from mien.lab.synthetic.references import REFERENCES, ReferenceCapture
 from mien.lab.synthetic.scene import SyntheticScene
-from mien.lab.synthetic.truth import surface_of
+from mien.lab.synthetic.truth import truth_of
 
 _FILE = Path(__file__).with_suffix(".json")
 _BLOCKS = 4
@@ -38,8 +39,9 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     cameras = sorted({0, len(scene.cameras) - 1})
     frames = [frame for step in timesteps for frame in scene.timestep_frames(step, cameras)]
     images, mattes = (np.stack([getattr(frame, part) for frame in frames]) for part in ("image", "matte"))
-    index, vertices, landmarks = surface_of(scene)
-    vertices = vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
+    truth = truth_of(scene)
+    index, landmarks = truth.vertex_index, truth.landmarks
+    vertices = truth.vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
     parts = {
         "means": _blocks(images).mean((2, 4)), "spreads": _blocks(images).std((2, 4)),
         "mattes": _blocks(mattes[..., None]).mean((2, 4)),
@@ -71,9 +73,20 @@ def stored_signatures() -> dict[str, dict[str, dict[str, list[float]]]]:
     return json.loads(_FILE.read_text(encoding="utf-8"))
 
 
+def tiny(reference: ReferenceCapture) -> ReferenceCapture:
+    """Return the same people and motions in three frames of 64x64 pixels from at most three cameras."""
+    size = {"width": 64, "height": 64, "texture_size": 128, "supersample": 1, "ring_size": 3}
+    small = [
+        replace(recipe, **size, fps=3 / sum(segment.seconds for segment in recipe.script))
+        for recipe in reference.sequences
+    ]
+    views = None if reference.views is None else replace(reference.views, first=1, every=1)
+    return replace(reference, sequences=tuple(small), views=views)
+
+
 def drawn_signatures(reference: ReferenceCapture) -> dict[str, dict[str, list[float]]]:
     """Return the signatures by sequence and part, as this machine draws them."""
-    return {scene.recipe.name: signature_of(scene) for scene in reference.tiny().scenes()}
+    return {scene.recipe.name: signature_of(scene) for scene in tiny(reference).scenes()}
 
 
 if __name__ == "__main__":

@@ -25,9 +25,8 @@ MAY_NAME = {
     "src/mien/avatar/methods.py": "the list of methods",
     "src/mien/avatar/point_avatar/avatar.py": "uses the deformation network that its successor took over",
     "src/mien/lab/analysis/registry.py": "the list of analyses, one for the paper of each method",
-    "src/mien/lab/benchmarking/registry.py": "the list of benchmarks of training steps",
+    "src/mien/lab/benchmarking/__init__.py": "the list of benchmarks of training steps",
     "src/mien/lab/benchmarking/train_step.py": "measures the step of one method",
-    "src/mien/lab/benchmarking/device.py": "measures the step of one method on a GPU",
     "src/mien/lab/benchmarking/headgas_step.py": "measures the step of one method",
     "src/mien/lab/benchmarking/mono_step.py": "measures the step of one method",
     "src/mien/formats/registry.py": "the list of formats; one is named after the program whose files it reads",
@@ -36,7 +35,7 @@ MAY_NAME = {
     "src/mien/formats/gaussian_avatars.py": "the files of that method's own program become its avatars",
 }
 """Files that may name a method although they are not its own, and why."""
-OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}/")
+OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}.py")
 """Files of a method itself."""
 
 

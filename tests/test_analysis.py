@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -20,12 +21,10 @@ from damage import edit_json
 from mien.cli import main
 from mien.disk.files import write_tensors
 from mien.face import FaceModel
-from mien.lab.analysis.gaussian_avatars import growth, speed
-from mien.lab.analysis.gaussian_avatars.teeth import jaw_opening, open_jaw, without_teeth
+from mien.lab.analysis import gaussian_avatars, measuring
+from mien.lab.analysis.gaussian_avatars import binned, jaw_opening, open_jaw, without_teeth
 from mien.lab.analysis.registry import ANALYSES
-from mien.lab.analysis.result import Chart, PartResult, Table
-from mien.lab.analysis.running import run_analysis
-from mien.lab.analysis.spec import Analysis, AnalysisOptions, Part
+from mien.lab.analysis.result import Chart, Result, Table
 from mien.pages.plots import Axes, Series
 from mien.training.run import read_curves
 from shared_things import MadeOnce, toy_workspace, write_toy_workspace
@@ -50,7 +49,7 @@ def toy_with_teeth(rings: int = 9, around: int = 12) -> FaceModel:
 @pytest.fixture
 def workspace(made_once: MadeOnce, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a copy of a workspace whose run has teeth."""
-    monkeypatch.setattr(speed, "TABLE_3", SIZES)
+    monkeypatch.setattr(gaussian_avatars, "TABLE_3", SIZES)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(toy_scene, "toy_face_model", toy_with_teeth)
         return Path(shutil.copytree(made_once("toy_with_teeth", write_toy_workspace), tmp_path / "W"))
@@ -80,11 +79,15 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
     folder = workspace / "analysis/toy"
     page = (folder / "analysis.html").read_text()
     for part in ANALYSES["gaussian-avatars"].parts:
-        assert escape(part.summary) in page
+        assert escape(part.title) in page
         kept = parts[part.name]
         assert kept["findings"] or part.name == "teeth-trained"
-        for entry in (*kept["charts"], *kept["pictures"]):
-            assert (folder / entry["file"]).read_bytes().startswith(b"\x89PNG")
+        assert all((folder / entry["file"]).read_bytes().startswith(b"\x89PNG") for entry in kept["pictures"])
+        for entry in kept["charts"]:  # each chart is a file that shows its title and what its lines are
+            shown = [
+                one.text for one in ElementTree.parse(folder / entry["file"]).iter("{http://www.w3.org/2000/svg}text")
+            ]
+            assert {entry["title"], *(one["label"] for one in entry["series"])} <= set(shown)
     assert not re.search(r"<script|<link|(?:src|href)=\"(?!data:)", page), "the page is one file"
     for device in ([], ["dark", "touch"]):  # axe-core finds no fault
         assert violations(folder / "analysis.html", (390, 844), device) == []
@@ -100,9 +103,9 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_nothing_is_measured_twice(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stopped command keeps its rows; the same command measures nothing; other options or avatars measure again."""
+    """A stopped command keeps its parts; the same command measures nothing; other options or avatars measure again."""
     measured: list[tuple[int, int]] = []
-    real = speed.measure_drawing
+    real = measuring.measure_drawing
 
     def stop_at_second(avatar: Any, camera: Any, seconds: float) -> Any:
         measured.append((camera.width, camera.height))
@@ -110,19 +113,22 @@ def test_nothing_is_measured_twice(workspace: Path, monkeypatch: pytest.MonkeyPa
             raise KeyboardInterrupt
         return real(avatar, camera, seconds)
 
-    monkeypatch.setattr(speed, "measure_drawing", stop_at_second)
+    monkeypatch.setattr(measuring, "measure_drawing", stop_at_second)
     asked = ("--parts", "speed", "growth", "--seconds", "0.01")
     assert main(["analyze", "gaussian-avatars", str(workspace), *asked]) == 130
+    record = json.loads((workspace / "analysis/toy/analysis.json").read_text())
+    assert list(record["parts"]) == ["growth"]
     first = analyze(workspace, *asked)
-    assert measured == [(16, 24), (24, 32), (24, 32)]
+    assert measured == [(16, 24), (24, 32), (16, 24), (24, 32)]
     assert analyze(workspace, *asked)["parts"] == first["parts"]
-    (workspace / "analysis/toy/speed.png").unlink()
+    assert len(measured) == 4
+    (workspace / "analysis/toy/speed.svg").unlink()
     analyze(workspace, *asked)
-    assert (workspace / "analysis/toy/speed.png").is_file()
-    assert len(measured) == 3
+    assert (workspace / "analysis/toy/speed.svg").is_file()
+    assert len(measured) == 6
     other = analyze(workspace, "--parts", "speed", "--seconds", "0.02")
     assert list(other["parts"]) == ["growth", "speed"], "parts that are not asked for stay"
-    assert len(measured) == 5
+    assert len(measured) == 8
     shutil.rmtree(workspace / "runs")
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(toy_scene, "toy_face_model", toy_with_teeth)
@@ -133,7 +139,7 @@ def test_nothing_is_measured_twice(workspace: Path, monkeypatch: pytest.MonkeyPa
 
 def test_growth_of_known_curves(workspace: Path) -> None:
     """Steps of 10 ms with 1,000 Gaussians and of 30 ms with 8,000 are a growth of 3 times and 8 times."""
-    x, y = growth.binned(np.linspace(1000, 8000, 100), np.linspace(10, 30, 100))
+    x, y = binned(np.linspace(1000, 8000, 100), np.linspace(10, 30, 100))
     assert (len(x), x[0] < 1400, y[-1] > 29) == (12, True, True)
     path = workspace / "runs/toy/curves.safetensors"
     curves = read_curves(workspace / "runs/toy")
@@ -184,21 +190,21 @@ def test_a_run_without_teeth_says_so(made_once: MadeOnce, tmp_path: Path) -> Non
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
 
 
-def part_of_dots(_: Any) -> PartResult:
+def part_of_dots(_: Any) -> Result:
     dots = Series("dots", np.arange(3.0), np.array([1.0, np.nan, 3.0]), points=True)
     table = Table(("name", "value"), (("some", 1234), ("none", None)), "a caption")
     chart = Chart("dots", "Dots", (dots,), Axes("x", "y", shaded=((0.0, 1.0),)))
-    return PartResult({}, ("It is found.",), (table,), (chart,), notes=("a <b> note",))
+    return Result({}, ("It is found.",), (table,), (chart,), notes=("a <b> note",))
 
 
-def test_tables_and_charts_of_any_analysis_are_read_again(workspace: Path, tmp_path: Path) -> None:
-    dotted = Analysis("gaussian_avatars", "a paper", (Part("dots", "Dots", "test_analysis:part_of_dots"),))
-    arguments = (dotted, dotted.parts, workspace / "runs/toy", (), tmp_path / "out", AnalysisOptions())
-    parts, page = run_analysis(*arguments)["parts"], (tmp_path / "out/analysis.html").read_text()
-    assert all(words in page for words in ("a &lt;b&gt; note", "1,234", "–", "<circle"))
-    assert parts["dots"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
-    assert run_analysis(*arguments)["parts"] == parts
-    assert (tmp_path / "out/analysis.html").read_text() == page
+def test_tables_and_charts_of_any_analysis_are_read_again(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gaussian_avatars, "growth", part_of_dots)
+    parts, page = analyze(workspace, "--parts", "growth")["parts"], workspace / "analysis/toy/analysis.html"
+    shown = page.read_text()
+    assert all(words in shown for words in ("a &lt;b&gt; note", "1,234", "–", "<circle"))
+    assert parts["growth"]["charts"][0]["series"][0]["y"] == [1.0, None, 3.0]
+    assert analyze(workspace, "--parts", "growth")["parts"] == parts
+    assert page.read_text() == shown
 
 
 BAD = [
@@ -238,21 +244,10 @@ def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.Monk
     assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", "W", "--run", "toy", "--parts", "scale")
 
 
-def test_a_damaged_record_is_told_in_one_line(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    expected, path = analyze(workspace, "--parts", "growth"), workspace / "analysis/toy/analysis.json"
-    whole = path.read_bytes()
-    edit_json(path, lambda content: content.update(paper={"2": []}, run=3))
-    again = analyze(workspace, "--parts", "growth")
-    assert [again[name] for name in ("run", "paper", "parts")] == [expected[name] for name in ("run", "paper", "parts")]
-    capsys.readouterr()
-    for change in (
-        lambda content: content["parts"]["growth"]["tables"].append(3),
-        lambda content: content["parts"]["growth"]["charts"][0].update(file="../../a.png"),
-        lambda content: content.update(parts=3),
-    ):
-        path.write_bytes(whole)
-        edit_json(path, change)
-        assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace), "--parts", "growth")
+def test_a_damaged_record_is_told_and_links_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    analyze(workspace, "--parts", "growth")
+    edit_json(workspace / "analysis/toy/analysis.json", lambda content: content.update(parts=3))
+    assert "analysis.json: incomplete or damaged" in complaint(capsys, "analyze", str(workspace), "--parts", "growth")
     shutil.rmtree(workspace / "analysis")
     (workspace / "analysis").symlink_to(workspace.parent)
     assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))

@@ -271,7 +271,7 @@ def test_the_table_names_key_and_baselines(tmp_path, capsys):
     assert "| mesh |" in table
     assert "1.00 mm | 2.00 px | 3.00 (0.50) deg | - | - | - | - |" in table
     known = quality.TrackingErrors(1.0, 2.0, 3.0, 0.5, 0.02, 0.04, following.Following(0.3, 7.0, 5), None, 0.61)
-    assert quality.tracking_cells(known).endswith("| 0.020 px, 0.040 mm | 0.30 frames, 7 % (5) | - | 0.61 %")
+    assert quality.tracking_cells(known)[-4:] == ["0.020 px, 0.040 mm", "0.30 frames, 7 % (5)", "-", "0.61 %"]
     # An unknown capture is told.
     assert "mono-short" in complaint(capsys, "bench", "quality", "--captures", "mono", "--out", str(tmp_path))
     assert set(get_args(CaptureName)) == set(REFERENCES), "the command line knows their names without importing them"
@@ -310,10 +310,6 @@ def test_delay_and_height_are_found_in_coefficients_and_in_turns():
     assert found.lag_frames == pytest.approx(1.5, abs=0.1)
     assert found.loss_percent == pytest.approx(10, abs=2)
     assert following.turn_following(exact_of(turns())[0], exact_of(0 * turns())[1], FPS) is None
-    # A mean rotation is in the middle.
-    vectors = torch.tensor([[0.0, 0.3, 0.0], [0.0, -0.1, 0.0]])
-    middle = axis_angle_from_matrix(following.mean_rotation(matrix_from_axis_angle(vectors)))
-    torch.testing.assert_close(middle, torch.tensor([0.0, 0.1, 0.0]).double(), atol=1e-6, rtol=0)
 
 
 def exact_of(rotations: torch.Tensor) -> tuple[Tracking, Truth]:

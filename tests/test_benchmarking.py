@@ -15,10 +15,9 @@ from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
-from mien.lab.benchmarking import device as device_benchmark
 from mien.lab.benchmarking import headgas_step, mono_step, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
-from mien.lab.benchmarking.timing import BenchmarkRow, Timing, time_function
+from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, thread_counts, time_function
 from mien.training.trainer import step
 from refusals import complaint
 
@@ -42,7 +41,8 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
     # Times of a step are those of one frame.
     state, _ = mono_step.mono_case(load_face_model(), 3000, (64, 48), frames=4)
     assert state.avatar.extras.frames_per_step() == 4
-    assert mono_step.per_frame(Timing(8.0, 12.0, 16.0), 4) == Timing(2.0, 3.0, 4.0)
+    row = mono_step.per_frame(benchmark_row("a step", 3000, (64, 48), Timing(8.0, 12.0, 16.0)), 4)
+    assert (row.min_ms, row.median_ms, row.cpu_ms) == (2.0, 3.0, 4.0)
     # Waiting for a picture is measured with the worker and without.
     rows = list(train_step.waiting_rows(load_face_model(), 500, (64, 48), 0.01))
     assert [row.name for row in rows] == ["wait_for_target", "make_target"]
@@ -51,28 +51,30 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 
 def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
-    monkeypatch.setattr(render_benchmark, "SIZES", {"a": (40, 30), "b": (32, 32)})
+    monkeypatch.setattr(render_benchmark, "SIZES", ((40, 30), (32, 32)))
     chart = tmp_path / "chart.svg"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gflops"] > 0
     rows = [BenchmarkRow(**row) for row in shown["rows"]]
-    wanted = itertools.product(((40, 30), (32, 32)), (5, 20), render_benchmark.thread_counts())
+    wanted = itertools.product(((40, 30), (32, 32)), (5, 20), thread_counts())
     assert {((row.width, row.height), row.gaussians, row.threads) for row in rows} == set(wanted)
     assert all(0 < row.min_ms <= row.median_ms for row in rows)
-    assert all(f"{size}, 1 thread " in chart.read_text() for size in ("40x30", "32x32"))
+    assert all(words in chart.read_text() for words in ("rasterize forward, 1 thread", "40x30", "32x32"))
     # Instruction sets are compared, and restored.
     monkeypatch.setattr(render_benchmark, "COUNTS", ())
-    monkeypatch.setattr(render_benchmark, "benchmark_render", lambda *_: [_native.rasterize_isa()])
+    monkeypatch.setattr(
+        render_benchmark, "head_scene", lambda *_, head_scene=render_benchmark.head_scene: head_scene(9, 8, 8)
+    )
     best = _native.rasterize_isa()
-    shown = [str(isa) for isa in render_benchmark.render_suite()]
+    shown = [row.isa for row in render_benchmark.render_suite(0.0)]
     assert shown[0] == best
-    assert len(shown) == len(set(shown))
+    assert len(shown) == 2 * len(set(shown))
     assert _native.rasterize_isa() == best
 
 
 @pytest.mark.parametrize(("line", "told"), [
-    ("scaling --plot chart.jpg", ".png, .svg, .pdf"),
+    ("scaling --plot chart.jpg", "charts are written as .svg"),
     ("train-step --parts --method headgas", "--parts --method headgas"),
     ("train-step --seconds=0", "--seconds 0: give a positive number"),
 ])  # fmt: skip
@@ -129,10 +131,11 @@ def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...])
 
 def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """The cases of a GPU run in float64 on the CPU, which executes all of their code but gsplat's."""
-    monkeypatch.setattr(device_benchmark, "COUNTS", (60,))
-    monkeypatch.setattr(device_benchmark, "SIZES", ((24, 16),))
+    for room in (render_benchmark, train_step):
+        monkeypatch.setattr(room, "GPU_COUNTS", (60,))
+        monkeypatch.setattr(room, "PAPER_SIZES", {"": (24, 16)})
     like = torch.zeros((), dtype=torch.float64)
-    rows = [*device_benchmark.render_rows(like, 0.0), *device_benchmark.train_step_rows(like, 0.0)]
+    rows = [*render_benchmark.gpu_rows(like, 0.0), *train_step.gpu_rows(like, 0.0)]
     names = ["rasterize_forward", "rasterize_forward_backward", "train_step", "pose_and_render"]
     assert [row.name for row in rows] == names
     assert all((row.gaussians, row.width, row.height) == (60, 24, 16) and row.min_ms > 0 for row in rows)
@@ -143,7 +146,8 @@ def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: py
 @pytest.mark.gpu
 @pytest.mark.parametrize("what", ["render", "train-step"])
 def test_a_gpu_is_measured(what: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_benchmark, "COUNTS", (1000,))
+    for room in (render_benchmark, train_step):
+        monkeypatch.setattr(room, "GPU_COUNTS", (1000,))
     assert main(["bench", what, "--device", "cuda", "--json", "--seconds", "0.001"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gpu"]

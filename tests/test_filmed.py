@@ -24,7 +24,7 @@ from mien.driving.motion import ARKIT_NAMES
 from mien.evaluation import living
 from mien.evaluation.living import Living
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.lab.benchmarking.quality import unseen_lines
+from mien.lab.benchmarking.quality import unseen_table
 from mien.lab.benchmarking.unseen_views import Front, angle_names, camera_beside, write_unseen_chart
 from mien.lab.synthetic.recipe import SIDES
 from mien.lab.synthetic.references import REFERENCES
@@ -37,6 +37,7 @@ from mien.runtime.baked import Filmed
 from mien.runtime.filmed import ROOM, head_angles, soft_limits, within_filmed_inputs, within_filmed_poses
 from mien.training.footage.filmed import FILE, read_coverage
 from plain_settings import plain_config
+from reference_signatures import tiny
 from refusals import complaint, refuses
 from shared_things import toy_workspace, write_toy_workspace
 from small_face_model import make_small_face_model
@@ -293,7 +294,7 @@ def test_views_begin_at_the_tracked_camera_and_show_moments_of_the_held_out_sequ
     # The side views are those timesteps of the sequence, in the front camera as well, and no one else's.
     reference = REFERENCES["mono-sides"]
     assert known(reference.views).sequence in reference.held_out_sequences
-    front, aside, views = reference.tiny().scenes()
+    front, aside, views = tiny(reference).scenes()
     for index, timestep in enumerate(known(views.moments)):
         torch.testing.assert_close(views.vertices(index), aside.vertices(timestep))
     assert not torch.equal(front.vertices(0), aside.vertices(0))
@@ -337,9 +338,9 @@ def test_table_and_chart(tmp_path) -> None:  # noqa: ANN001
     figures = {"psnr": 20.0, "ssim": 0.5, "l1": 0.1, "perceptual": 0.25}
     unknown = {**figures, "head": {**figures, "perceptual": None}}
     rows = {name: {"avatar": {**figures, "head": figures}, "mesh": unknown} for name in names}
-    assert unseen_lines("mono-sides", rows)[3] == "| 15 | 20.00 / 0.500 / 0.250 | 20.00 / 0.500 / - |"
-    write_unseen_chart(tmp_path / "chart.png", rows)
-    assert (tmp_path / "chart.png").stat().st_size > 1000
+    assert unseen_table("mono-sides", rows).splitlines()[3] == "| 15 | 20.00 / 0.500 / 0.250 | 20.00 / 0.500 / - |"
+    write_unseen_chart(tmp_path / "chart.svg", rows)
+    assert (tmp_path / "chart.svg").stat().st_size > 1000
     assert REFERENCES["ring-16"].views is None
 
 

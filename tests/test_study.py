@@ -16,11 +16,8 @@ import train_toy
 from known import known
 from mien.avatar.methods import METHODS
 from mien.cli import main
-from mien.lab.analysis.study.clips import spans
-from mien.lab.analysis.study.drawing import encode
-from mien.lab.analysis.study.files import QUESTIONS, read_all_answers, read_key
-from mien.lab.analysis.study.settings import StudySettings
-from mien.lab.analysis.study.shuffling import shuffled
+from mien.lab.analysis.study.files import QUESTIONS, read_all_answers, read_key, shuffled
+from mien.lab.analysis.study.making import encode, spans
 from mien.media.video import read_video_frames
 from mien.training import read_sequence, train
 from refusals import refuses
@@ -133,9 +130,9 @@ def test_the_budget_is_kept(workspace: Path, tmp_path: Path, capsys: pytest.Capt
     assert page.stat().st_size <= 1_000_000
     assert "of 1 MB" in capsys.readouterr().err
     noise = np.random.default_rng(0).integers(0, 255, (4, 64, 256, 3), dtype=np.uint8)
-    best, small = encode(noise, 25.0, 1 << 20, "it"), encode(noise, 25.0, 30_000, "it")
-    assert best.crf < small.crf
-    assert len(small.data) <= 30_000
+    (_, best), (small, worse) = encode(noise, 25.0, 1 << 20, "it"), encode(noise, 25.0, 30_000, "it")
+    assert best < worse
+    assert len(small) <= 30_000
     refuses("it: does not fit into the page even at the lowest quality", encode, noise, 25.0, 1_000, "it")
 
 
@@ -293,9 +290,3 @@ def test_a_participant_answers_in_a_browser_under_a_name_of_their_own(page: Path
     name = 'document.getElementById("participant").textContent'
     first, other = (browse(page, [START, name])["results"][1] for _ in range(2))
     assert first != other
-
-
-def test_defaults_are_the_paper_s() -> None:
-    settings = StudySettings()
-    settings.check()
-    assert settings.clips == 10

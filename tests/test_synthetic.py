@@ -135,12 +135,12 @@ def test_a_ring_is_a_calibrated_capture_whose_truth_is_what_the_face_model_says(
 
 @pytest.mark.unchecked
 def test_an_interrupted_drawing_goes_on(tmp_path):
-    scene, store = SyntheticScene(TINY, 3), Pictures(tmp_path / ".drawing", TINY, TINY.timesteps)
-    store.resume(inputs_hash(scene))
+    scene = SyntheticScene(TINY, 3)
+    store = Pictures(tmp_path / ".drawing", scene)
+    assert store.resume(inputs_hash(scene)) == 0
     for timestep in range(5):
-        frame = scene.frame(timestep)
-        store.append(timestep, frame.image[None], frame.matte[None])
-    store.mark(inputs_hash(scene), 5)
+        store.write(timestep, [scene.frame(timestep)])
+    assert store.resume(inputs_hash(scene)) == 5
     folders = (tmp_path, tmp_path / "at once")
     for folder in folders:
         write_synthetic_capture(TINY, 3, folder)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_tiles import render_tiles
 
 from mien import _native
-from mien.lab.benchmarking.scenes import Scene, head_scene
+from mien.lab.benchmarking.render import Scene, head_scene
 from mien.lab.benchmarking.timing import Timing, benchmark_row, format_machine, format_row, measure_machine
 from mien.render import rasterize
 

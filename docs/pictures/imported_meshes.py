@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import dataset_scene  # noqa: E402
 import dataset_writers as writers  # noqa: E402
-from mien.datasets import matting, sequences  # noqa: E402
+from mien.datasets import pictures, sequences  # noqa: E402
 from mien.datasets.dataset import TrackedSequence  # noqa: E402
 from mien.datasets.registry import recognised  # noqa: E402
 from mien.datasets.writing import write_sequence  # noqa: E402
@@ -69,7 +69,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         scene = dataset_scene.drawn_person()
         with (
-            mock.patch.object(matting, "fill_mattes", not_white),
+            mock.patch.object(pictures, "fill_mattes", not_white),
             mock.patch.object(sequences, "detected_landmarks", lambda images: writers.nerface_landmarks(scene, images)),
         ):
             for layout in LAYOUTS:

@@ -45,11 +45,9 @@ from mien.formats.shared.packed import pack
 from mien.formats.sog import write_sog
 from mien.formats.spz import write_spz
 from mien.formats.usd import write_usd
-from mien.lab.analysis.registry import ANALYSES
+from mien.lab.analysis.registry import ANALYSES, AnalysisOptions, chosen_parts
 from mien.lab.analysis.running import run_analysis
-from mien.lab.analysis.spec import AnalysisOptions, chosen_parts
-from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, write_key
-from mien.lab.analysis.study.shuffling import shuffled
+from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, shuffled, write_key
 from mien.media.sound import RATE
 from mien.media.video import write_video
 from mien.runtime import write_portable

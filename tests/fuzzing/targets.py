@@ -115,7 +115,7 @@ _TARGETS = (
     Target("metrics.json", f"{RUN}/metrics.json", lambda root, file: uses.known(read_metrics(root / RUN)),
            uses.use_comparison, 2, True),
     Target("analysis.json", f"{ANALYSIS}/analysis.json", uses.read_analysis, weight=2, exact=True),
-    Target("charts", f"{ANALYSIS}/*.png", uses.read_analysis, weight=0.3),
+    Target("charts", f"{ANALYSIS}/*.svg", uses.read_analysis, weight=0.3),
     Target("partial scores", f"{RUN}/.*.partial", lambda root, file: PartialScores(file, "0").read(),
            uses.use_evaluation, fault=faults.any_fault),
     Target("pieces", f"{PIECES}/*.safetensors", lambda root, file: go_on(root / PIECES), weight=0.3, named=False),

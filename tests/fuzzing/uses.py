@@ -48,8 +48,8 @@ from mien.face.models.flame import flame_face_model
 from mien.formats import in_world, read_ply, write_ply
 from mien.formats.gaussian_avatars import write_gaussian_avatars_folder
 from mien.formats.shared.glb_file import read_glb
+from mien.lab.analysis.registry import AnalysisOptions
 from mien.lab.analysis.running import run_analysis
-from mien.lab.analysis.spec import AnalysisOptions
 from mien.lab.analysis.study.files import read_all_answers, read_key
 from mien.lab.analysis.study.tally import tally_content, tally_text
 from mien.media.source import FrameSelection, open_source, read_image

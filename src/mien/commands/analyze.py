@@ -10,8 +10,7 @@ import tyro
 from mien.commands.parsing.help_text import Described
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
-from mien.lab.analysis.registry import ANALYSES
-from mien.lab.analysis.spec import Analysis, AnalysisOptions, chosen_parts
+from mien.lab.analysis.registry import ANALYSES, Analysis, AnalysisOptions, chosen_parts
 
 
 def _about_target() -> str:
@@ -22,8 +21,8 @@ def _about_target() -> str:
 class Command:
     """Measure on a run what the paper of its method measures, and show it beside the paper's figures.
 
-    Writes analysis.html (one page), analysis.json and a .png for each chart and picture. A stopped command continues
-    where it was, and what is measured is not measured again.
+    Writes analysis.html (one page), analysis.json, a .svg for each chart and a .png for each picture. A stopped command
+    continues where it was, and what is measured is not measured again.
     """
 
     target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_target)]

@@ -13,7 +13,7 @@ from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.commands.parsing.options import PresetName, check_method, listed_methods
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
-from mien.lab.benchmarking.registry import STEP_BENCHMARKS
+from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
 from mien.machine.terminal import show
 from mien.plugins import named
@@ -21,7 +21,7 @@ from mien.plugins import named
 if TYPE_CHECKING:
     import torch
 
-    from mien.lab.benchmarking.timing import BenchmarkRow, Machine
+    from mien.lab.benchmarking.timing import BenchmarkRow
 
     StepMethod = str
 else:
@@ -54,15 +54,11 @@ class Render:
 
     def run(self) -> None:
         """Measure and print the rows."""
-        from mien.lab.benchmarking.render import render_suite
+        from mien.lab.benchmarking.render import gpu_rows, render_suite
 
         like = _gpu(self.device)
-        if like is None:
-            show_rows(render_suite(self.seconds), self.as_json)
-            return
-        from mien.lab.benchmarking.device import render_rows
-
-        show_rows(render_rows(like, self.seconds), self.as_json, gpu=True)
+        rows = render_suite(self.seconds) if like is None else gpu_rows(like, self.seconds)
+        show_rows(rows, self.as_json, gpu=like is not None)
 
 
 @dataclass(frozen=True)
@@ -74,24 +70,25 @@ class Scaling:
     seconds: float = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     plot: Path | None = None
-    """File for a chart: .png, .svg or .pdf (default: no chart)."""
+    """File for a chart, .svg (default: no chart)."""
 
     def check(self) -> None:
         """Check before any measurement that the chart can be written and that there is time to measure."""
-        from mien.lab.benchmarking.chart_path import check_chart_path
+        from mien.disk.files import check_writable
 
         _check_seconds(self.seconds)
         if self.plot is not None:
-            check_chart_path(self.plot)
+            if self.plot.suffix != ".svg":
+                raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
+            check_writable(self.plot)
 
     def run(self) -> None:
         """Measure and print the rows, then draw the chart."""
-        from mien.lab.benchmarking.charts import write_scaling_chart
-        from mien.lab.benchmarking.render import scaling_suite
+        from mien.lab.benchmarking.render import scaling_suite, write_scaling_chart
 
-        machine, rows = show_rows(scaling_suite(self.seconds), self.as_json)
+        rows = show_rows(scaling_suite(self.seconds), self.as_json)
         if self.plot is not None:
-            write_scaling_chart(self.plot, rows, machine)
+            write_scaling_chart(self.plot, rows)
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,7 @@ class TrainStep:
         """Check that CUDA has gsplat and that there is time to measure."""
         check_device(self.device)
         _check_seconds(self.seconds)
-        if STEP_BENCHMARKS[self.method].on_gpu is None and self.device == "cuda":
+        if self.method not in GPU_BENCHMARKS and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
         if self.parts and self.method != DEFAULT_METHOD:
             raise UserError(f"--parts --method {self.method}: only {DEFAULT_METHOD} has parts; leave out one")
@@ -128,12 +125,11 @@ class TrainStep:
         if self.parts:
             _show_parts(self.seconds, self.as_json)
             return
-        benchmark = STEP_BENCHMARKS[self.method]
-        like = None if benchmark.on_gpu is None else _gpu(self.device)
-        if benchmark.on_gpu is None or like is None:
-            show_rows(named(benchmark.suite)(self.seconds), self.as_json)
+        like = _gpu(self.device) if self.method in GPU_BENCHMARKS else None
+        if like is None:
+            show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)
         else:
-            show_rows(named(benchmark.on_gpu)(like, self.seconds), self.as_json, gpu=True)
+            show_rows(named(GPU_BENCHMARKS[self.method])(like, self.seconds), self.as_json, gpu=True)
 
 
 @dataclass(frozen=True)
@@ -286,7 +282,7 @@ def _gpu(name: DeviceName) -> "torch.Tensor | None":
     return like_on(device) if device.type == "cuda" else None
 
 
-def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) -> "tuple[Machine, list[BenchmarkRow]]":
+def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) -> "list[BenchmarkRow]":
     """Print the machine, and each row once it is measured, or everything as json. Torch uses one thread."""
     import torch
 
@@ -302,4 +298,4 @@ def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) 
             show(format_row(row))
     if as_json:
         show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
-    return machine, shown
+    return shown

@@ -12,8 +12,8 @@ from mien.errors import UserError
 from mien.machine.terminal import show
 
 if TYPE_CHECKING:
-    from mien.lab.analysis.study.clips import StudyRuns
-    from mien.lab.analysis.study.settings import StudySettings
+    from mien.lab.analysis.study.files import StudySettings
+    from mien.lab.analysis.study.making import StudyRuns
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Make:
         say(f"Look at {self.out} and send it; keep {key}, then: mien study tally {key} ANSWERS.json ...")
 
     def _settings(self) -> "StudySettings":
-        from mien.lab.analysis.study.settings import StudySettings
+        from mien.lab.analysis.study.files import StudySettings
 
         return StudySettings(self.clips, self.seconds, self.side, self.megabytes, self.seed)
 
@@ -155,7 +155,7 @@ class Command:
 
 
 def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":
-    from mien.lab.analysis.study.clips import StudyRuns
+    from mien.lab.analysis.study.making import StudyRuns
     from mien.pipeline.evaluate import run_sequences
 
     folders = {label: workspace.run_dir(label) for label in labels}

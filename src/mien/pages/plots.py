@@ -1,20 +1,25 @@
 """Line charts as inline SVG, without scripts or fonts. The page's CSS sets the colours, so they fit light and dark.
 
-The SVG is in `mien/templates/chart.html`. The code here finds the ticks and the positions.
+The SVG is in `mien/templates/chart.html`, or `chart.svg` for a file of its own. The code here finds the ticks and the
+positions.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
+from mien.disk.files import write_atomically
 from mien.pages.pages import render
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 12, 10, 34
+_TITLE, _LEGEND = 26, 16
+"""Heights of a title, and of a line of the legend below a chart, in files."""
 _MAX_POINTS = 400
 
 
@@ -45,26 +50,52 @@ class Axes:
     """Whether the y axis starts at 0."""
     shaded: tuple[tuple[float, float], ...] = ()
     """Spans of x with a tinted background."""
+    logarithmic: bool = False
+    """Whether both axes are logarithmic. All values are then positive."""
 
 
 def line_chart(series: Sequence[Series], axes: Axes) -> Markup:
     """An <svg> of some series over common axes. Series without a finite value are left out."""
-    drawn = [one for one in series if np.isfinite(one.y).any()]
+    drawn = _finite(series)
     if not drawn:
         return Markup('<p class="note">There are no values to draw.</p>')
-    x_range = _range(np.concatenate([one.x for one in drawn]))
-    y_range = _padded(_range(np.concatenate([one.y for one in drawn])), axes.from_zero)
+    return render("templates/chart.html", **_content(drawn, axes))
+
+
+def write_chart(path: Path, charts: Sequence[tuple[str, Sequence[Series], Axes]]) -> None:
+    """Write charts (title, series, axes) as one .svg file, one below the other, in the colours of the pages."""
+    rows, top = [], 0
+    for title, series, axes in charts:
+        content = _content(_finite(series), axes)
+        legend = content["series"] if len(content["series"]) > 1 else []
+        rows.append({**content, "title": title, "top": top, "legend": legend})
+        top += axes.height + _TITLE + _LEGEND * len(legend)
+    width = max(axes.width for _, _, axes in charts)
+    text = render("templates/chart.svg", rows=rows, width=width, height=top, title_height=_TITLE, line_height=_LEGEND)
+    write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
+
+
+def _finite(series: Sequence[Series]) -> list[Series]:
+    return [one for one in series if np.isfinite(one.y).any()]
+
+
+def _content(series: Sequence[Series], axes: Axes) -> dict[str, Any]:
+    """What the templates draw of series that each have a finite value."""
+    if axes.logarithmic:
+        series = [replace(one, x=np.log10(one.x), y=np.log10(one.y)) for one in series]
+    x_range = _range(np.concatenate([one.x for one in series]))
+    y_range = _padded(_range(np.concatenate([one.y for one in series])), axes.from_zero)
     plot = _Plot(axes, x_range, y_range)
-    return render(
-        "templates/chart.html",
-        axes=axes,
-        about=f"{axes.y_label} over {axes.x_label}: " + ", ".join(one.label for one in drawn),
-        left=_LEFT,
-        bands=[plot.band(span) for span in axes.shaded],
-        grid=[plot.grid_line(tick) for tick in _ticks(*y_range, 5)],
-        ticks=[plot.x_tick(tick) for tick in _ticks(*x_range, 6)],
-        series=[plot.drawn(one) for one in drawn],
-    )
+    ticks = _log_ticks if axes.logarithmic else _ticks
+    return {
+        "axes": axes,
+        "about": f"{axes.y_label} over {axes.x_label}: " + ", ".join(one.label for one in series),
+        "left": _LEFT,
+        "bands": [plot.band(span) for span in axes.shaded],
+        "grid": [plot.grid_line(tick) for tick in ticks(*y_range, 5)],
+        "ticks": [plot.x_tick(tick) for tick in ticks(*x_range, 6)],
+        "series": [plot.drawn(one) for one in series],
+    }
 
 
 def thin(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
@@ -96,10 +127,13 @@ class _Plot:
 
     def grid_line(self, value: float) -> dict[str, Any]:
         y, right = self._y(value), self._axes.width - _RIGHT
-        return {"left": _LEFT, "right": right, "y": f"{y:.1f}", "text_y": f"{y + 3.5:.1f}", "text": _number(value)}
+        return {"left": _LEFT, "right": right, "y": f"{y:.1f}", "text_y": f"{y + 3.5:.1f}", "text": self._text(value)}
 
     def x_tick(self, value: float) -> dict[str, Any]:
-        return {"x": f"{self._x(value):.1f}", "y": self._axes.height - _BOTTOM + 14, "text": _number(value)}
+        return {"x": f"{self._x(value):.1f}", "y": self._axes.height - _BOTTOM + 14, "text": self._text(value)}
+
+    def _text(self, value: float) -> str:
+        return _number(10**value if self._axes.logarithmic else value)
 
     def drawn(self, series: Series) -> dict[str, Any]:
         shape = {"dots": self._dots(series)} if series.points else {"path": self._path(series)}
@@ -143,6 +177,14 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
     power = 10.0 ** math.floor(math.log10(rough))
     step = min((factor * power for factor in (1, 2, 5, 10)), key=lambda size: abs(size - rough))
     return [index * step for index in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+
+
+def _log_ticks(low: float, high: float, about: int) -> list[float]:
+    """Logarithms of 1, 2 and 5 times powers of ten between two limits, or of the powers alone if those are enough."""
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    factors = (1,) if high - low >= about else (1, 2, 5)
+    every = [power + math.log10(factor) for power in powers for factor in factors]
+    return [tick for tick in every if low - 1e-9 <= tick <= high + 1e-9]
 
 
 def _number(value: float) -> str:

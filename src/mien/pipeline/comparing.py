@@ -111,7 +111,7 @@ def run_compare_stage(
 
 def _write(out: Path, rows: Items[MethodRow], settings: CompareSettings) -> dict[str, Any]:
     chosen = {**asdict(settings), "methods": list(settings.methods)}
-    content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": [row.as_json() for row in rows]}
+    content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": [asdict(row) for row in rows]}
     content = json.loads(json.dumps(content))
     write_json(out / "compare.json", _FORMAT, _VERSION, content)
     write_atomically(out / "compare.md", lambda path: path.write_text(comparison_table(rows), encoding="utf-8"))

@@ -5,7 +5,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +69,7 @@ def run_quality_stage(
     method_named(method)
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
         rows = _walk(references, out, method, steps, aligned)
-    show(json.dumps([row.as_json() for row in rows]) if as_json else markdown_table(rows))
+    show(json.dumps([asdict(row) for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
@@ -83,7 +83,7 @@ def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int
         row, strip = run_reference(reference, out, method, steps or reference.steps, aligned)
         rows.append(row)
         strips.append(strip)
-        content = {"rows": [row.as_json() for row in rows]}
+        content = {"rows": [asdict(row) for row in rows]}
         write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
         write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
         write_png(out / "contact_sheet.png", np.concatenate(strips))
@@ -192,7 +192,7 @@ def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Work
     moments = tuple(views.first + views.every * index for index in range(capture.timesteps))
     figures, sheet = score_side_views(experiment, views.sequence, SidePictures(capture, truth, moments), _UNSEEN)
     write_png(run_dir / "unseen_view.png", sheet)
-    write_unseen_chart(run_dir / "unseen_view_chart.png", figures)
+    write_unseen_chart(run_dir / "unseen_view_chart.svg", figures)
     write_json(run_dir / "unseen_view.json", "mien.unseen_view", 1, {"angles": figures})
     return figures
 

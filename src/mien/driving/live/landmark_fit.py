@@ -20,8 +20,8 @@ from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.sequence import FOCAL
 from mien.tracking.landmarks.detector_response import LARGEST_TURN, read_response
 from mien.tracking.landmarks.groups import EYE_CORNERS, NOSE, landmark_weights
-from mien.tracking.landmarks.stages import FIRST_OUTLIER
 from mien.tracking.landmarks.model import reduce_face_model
+from mien.tracking.landmarks.stages import FIRST_OUTLIER
 from mien.tracking.landmarks.term import LANDMARK_SIGMA
 from mien.tracking.settings import TrackingSettings
 

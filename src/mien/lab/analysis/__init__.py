@@ -1,5 +1,6 @@
 """Analyses: what a method's paper measures on a trained run, beside the paper's own figures.
 
-`spec` says what an analysis is, `registry` lists them by method, `result` holds what a part gives, and `running` runs
-the parts and writes analysis.json, plots and one page. Only the package of a method knows that method.
+`registry` lists the analyses and their parts, and `running` runs parts and writes analysis.json and one page. A part is
+a function from a run and options (`context`) to figures (`result`). `measuring` has what the parts measure and draw.
+Only the file of a method knows that method. `study` is apart: people compare runs.
 """

@@ -1,8 +1,100 @@
-"""The list of analyses, by the name that the command line takes. A new one adds one line here. Needs no torch."""
+"""The analyses, by the name that the command line takes. Needs no torch: a part's function is imported when it runs.
 
-from mien.lab.analysis.gaussian_avatars import ANALYSIS as GAUSSIAN_AVATARS
-from mien.lab.analysis.headgas import ANALYSIS as HEADGAS
-from mien.lab.analysis.mono_gaussian_avatar import ANALYSIS as MONO_GAUSSIAN_AVATAR
+A new analysis is an entry here, and a file named after its method. The file has a function for each part, from a
+`Context` to a `Result`.
+"""
 
-ANALYSES = {one.method.replace("_", "-"): one for one in (GAUSSIAN_AVATARS, HEADGAS, MONO_GAUSSIAN_AVATAR)}
-"""All analyses by the names of their methods, as `mien analyze` takes them."""
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from mien.disk.config import Range, check_ranges
+from mien.errors import UserError
+
+
+@dataclass(frozen=True)
+class AnalysisOptions:
+    """The user chooses these options besides the parts."""
+
+    steps: Annotated[int, Range(1, 1_000_000)] = 3_000
+    """Number of optimiser steps of each short training."""
+    seconds: Annotated[float, Range(0.01, 3600)] = 2.0
+    """Seconds to spend on each timed row. A row ends after the first picture that exceeds them."""
+
+    def check(self) -> None:
+        """Check that all numbers are in their ranges."""
+        check_ranges(self, lambda name: f"--{name}")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of an analysis. Its function has its name, with underscores."""
+
+    name: str
+    title: str
+    trainings: int = 0
+    """Number of short trainings, of `steps` each. Parts with trainings run only if they are asked for."""
+    timed: bool = False
+    """Whether the result depends on the seconds of a row and on the number of threads."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The analysis of a method, and the paper whose figures stand beside the measured ones."""
+
+    method: str
+    """Name of the method, as in `mien.avatar.METHODS`, and of the analysis' file."""
+    paper: str
+    parts: tuple[Part, ...]
+    """In the order of the page."""
+
+    @property
+    def about_parts(self) -> str:
+        """The parts for `mien analyze --help`."""
+        return "; ".join(f"{part.name} ({part.title})" for part in self.parts)
+
+
+_GAUSSIAN_AVATARS = Analysis(
+    "gaussian_avatars",
+    "GaussianAvatars (Qian et al., CVPR 2024), supplement",
+    (
+        Part("growth", "Gaussians and step time over training (Fig. 3)"),
+        Part("speed", "Drawing speed and memory (Table 3)", timed=True),
+        Part("teeth", "Teeth: the Gaussians on the teeth's triangles (Fig. 1)"),
+        Part("teeth-trained", "Teeth: trained with and without the teeth's triangles (Fig. 1)", trainings=2),
+        Part("scale", "The threshold of the scale loss (section C)", trainings=2, timed=True),
+    ),
+)
+_HEADGAS = Analysis(
+    "headgas",
+    "HeadGaS (Dhamo et al., ECCV 2024), supplement",
+    (
+        Part("basis", "What the bases learned: one expression at a time, beside the mesh (Fig. 1)"),
+        Part("layers", "Gaussians removed from near to far (Fig. 2)"),
+        Part("beyond", "Beyond the expressions and the views of training (Fig. 3)"),
+        Part("sizes", "Time of a frame against the size of the picture (Fig. 4)", timed=True),
+        Part("ablations", "The ablations, trained alike (Table 1)", trainings=6, timed=True),
+    ),
+)
+_MONO_GAUSSIAN_AVATAR = Analysis(
+    "mono_gaussian_avatar",
+    "MonoGaussianAvatar (Chen et al., SIGGRAPH 2024), supplement",
+    (
+        Part("times", "Time of training and of a frame (Table 4)", timed=True),
+        Part("convergence", "Held-out pictures during a training (Fig. 13)", trainings=1),
+        Part("resolutions", "Training at two resolutions (A.1)", trainings=2),
+        Part("diversity", "Fewer and less varied frames (A.4)", trainings=3),
+    ),
+)
+ANALYSES = {one.method.replace("_", "-"): one for one in (_GAUSSIAN_AVATARS, _HEADGAS, _MONO_GAUSSIAN_AVATAR)}
+
+
+def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[Part]:
+    """The parts of those names, in the analysis' order. Without names: all, or without `train` all that need none."""
+    known = [part.name for part in analysis.parts]
+    for name in names:
+        if name not in known:
+            raise UserError(f"--parts {name}: no such part; there are: {', '.join(known)}")
+    if names:
+        return [part for part in analysis.parts if part.name in names or (train and part.trainings)]
+    return [part for part in analysis.parts if train or not part.trainings]

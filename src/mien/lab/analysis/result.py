@@ -1,43 +1,52 @@
-"""Hold the results of a part of an analysis (values, tables, charts, pictures, films), and store them as json."""
+"""The result of a part of an analysis: values, tables, charts, pictures and films, as json and as a section of a page.
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+The section is made from the json, so that a part that was computed before looks the same again.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
+from markupsafe import Markup
 
-from mien.pages.plots import Axes, Series, thin
+from mien.disk.inside import inside
+from mien.disk.reading import read_bytes
+from mien.evaluation.page_parts import Card, Cell, DataTable, video_of
+from mien.evaluation.page_parts import Picture as PagePicture
+from mien.media.picture_files import write_png
+from mien.media.pictures import data_uri
+from mien.pages.pages import render
+from mien.pages.plots import Axes, Series, line_chart, thin, write_chart
 
 
 @dataclass(frozen=True)
 class Table:
     """Rows of figures. A cell is a text, a number or None."""
 
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str | float | int | None, ...], ...]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str | float | int | None]]
     caption: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A line chart. It is drawn on the page and as NAME.png."""
+    """A line chart. It is drawn on the page and as NAME.svg; the name is unique in the analysis."""
 
     name: str
-    """Name of the file without ending; unique in the analysis."""
     title: str
-    series: tuple[Series, ...]
+    series: Sequence[Series]
     axes: Axes
     caption: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture, written as NAME.png."""
+    """A picture, written as NAME.png; the name is unique in the analysis."""
 
     name: str
-    """Name of the file without ending; unique in the analysis."""
     image: UInt8[np.ndarray, "_ _ 3"]
     caption: str
 
@@ -47,27 +56,30 @@ class Film:
     """A video that the part has written into the analysis' folder."""
 
     file: str
-    """Name of the .mp4 in the folder."""
     caption: str
 
 
 @dataclass(frozen=True, eq=False)
-class PartResult:
+class Result:
     """The result of a part."""
 
     values: Mapping[str, Any]
     """Figures for programs, as json can hold them."""
-    findings: tuple[str, ...] = ()
+    findings: Sequence[str] = ()
     """The result in a sentence or two."""
-    tables: tuple[Table, ...] = ()
-    charts: tuple[Chart, ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    films: tuple[Film, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    tables: Sequence[Table] = ()
+    charts: Sequence[Chart] = ()
+    pictures: Sequence[Picture] = ()
+    films: Sequence[Film] = ()
+    notes: Sequence[str] = ()
     """How it was measured, and what limits the comparison."""
 
-    def content(self) -> dict[str, Any]:
-        """The result as json. Charts and pictures name their files; charts also hold their values."""
+    def write(self, folder: Path) -> dict[str, Any]:
+        """Write charts and pictures into a folder, and return the result as json, which names their files."""
+        for chart in self.charts:
+            write_chart(folder / f"{chart.name}.svg", [(chart.title, chart.series, chart.axes)])
+        for picture in self.pictures:
+            write_png(folder / f"{picture.name}.png", picture.image)
         return {
             "values": dict(self.values),
             "findings": list(self.findings),
@@ -79,19 +91,23 @@ class PartResult:
         }
 
 
-def file_names(content: Mapping[str, Any]) -> list[str]:
-    """The names of all files that the content of a part names."""
-    return [entry["file"] for kind in ("charts", "pictures", "films") for entry in content[kind]]
+def file_names(part: Mapping[str, Any]) -> list[str]:
+    """The names of all files that the json of a part names."""
+    return [entry["file"] for kind in ("charts", "pictures", "films") for entry in part[kind]]
 
 
-def chart_from(content: Mapping[str, Any]) -> Chart:
-    """The chart of an entry of `PartResult.content`."""
-    series = tuple(
-        Series(one["label"], _array(one["x"]), _array(one["y"]), one["style"], bool(one["points"]))
-        for one in content["series"]
+def section_html(title: str, part: Mapping[str, Any], folder: Path) -> Markup:
+    """The section of a part on the page, from its json and from the pictures and films in `folder`."""
+    return render(
+        "lab/analysis/templates/section.html",
+        title=title,
+        findings=part["findings"],
+        tables=[_table(table) for table in part["tables"]],
+        charts=[_card(entry) for entry in part["charts"]],
+        pictures=[_picture(entry["caption"], inside(folder, entry["file"])) for entry in part["pictures"]],
+        films=[video_of(inside(folder, entry["file"]), folder, entry["caption"]) for entry in part["films"]],
+        notes=part["notes"],
     )
-    axes = Axes(**{**content["axes"], "shaded": tuple(tuple(span) for span in content["axes"]["shaded"])})
-    return Chart(Path(content["file"]).stem, content["title"], series, axes, content["caption"])
 
 
 def _chart_content(chart: Chart) -> dict[str, Any]:
@@ -99,7 +115,7 @@ def _chart_content(chart: Chart) -> dict[str, Any]:
     for one in chart.series:
         x, y = (one.x, one.y) if one.points else thin(one.x, one.y)
         series.append({**asdict(one), "x": _numbers(x), "y": _numbers(y)})
-    named = {"file": f"{chart.name}.png", "title": chart.title, "caption": chart.caption}
+    named = {"file": f"{chart.name}.svg", "title": chart.title, "caption": chart.caption}
     return {**named, "axes": asdict(chart.axes), "series": series}
 
 
@@ -108,5 +124,21 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]
 
 
-def _array(values: list[float | None]) -> np.ndarray:
-    return np.array([np.nan if value is None else value for value in values], np.float64)
+def _card(entry: Mapping[str, Any]) -> Card:
+    series = [Series(**{**one, **{axis: np.array(one[axis], np.float64) for axis in "xy"}}) for one in entry["series"]]
+    return Card(entry["title"], line_chart(series, Axes(**entry["axes"])), entry["caption"])
+
+
+def _table(table: Mapping[str, Any]) -> DataTable:
+    head = [Cell(name) for name in table["columns"]]
+    return DataTable([head], [[Cell(_text(cell)) for cell in row] for row in table["rows"]], table["caption"])
+
+
+def _text(cell: str | float | int | None) -> str:
+    if cell is None:
+        return "–"
+    return cell if isinstance(cell, str) else f"{cell:,}"
+
+
+def _picture(caption: str, path: Path) -> PagePicture:
+    return PagePicture(caption, data_uri("image/png", read_bytes(path, 64 << 20)))

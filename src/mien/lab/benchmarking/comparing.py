@@ -1,11 +1,10 @@
 """Rows and tables of `mien bench compare`: several methods on the same frames, with the same budget."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
 
-_FRONT = "front"
 _QUALITY: tuple[tuple[str, str, int, bool], ...] = (
     ("head.psnr", "head: PSNR, dB", 2, True),
     ("head.ssim", "SSIM", 3, True),
@@ -47,10 +46,6 @@ class MethodRow:
     unseen_views: dict[str, Any] = field(default_factory=dict)
     """Figures by angle (`mien.lab.benchmarking.unseen_views`). Empty if the capture has no pictures from the side."""
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the row as a json object."""
-        return asdict(self)
-
     def figures(self, protocol: str) -> dict[str, float | None]:
         """Return every number of the table, by its dotted name. None if it was not computed."""
         entry = self.protocols[protocol]
@@ -66,7 +61,7 @@ class MethodRow:
 
 def unseen_mean(views: dict[str, Any], metric: str) -> float | None:
     """Return the mean over all angles but the front of an avatar's figure on the head crop, or None."""
-    known = [row["avatar"]["head"][metric] for angle, row in views.items() if angle != _FRONT]
+    known = [row["avatar"]["head"][metric] for angle, row in views.items() if angle != "front"]
     found = [value for value in known if value is not None]
     return fmean(found) if found else None
 
@@ -87,8 +82,7 @@ def comparison_table(rows: Sequence[MethodRow]) -> str:
         for column in (*_QUALITY, *_COST)
         if any(figures[column[0]] is not None for own in every.values() for _, figures in own)
     ]
-    heads = ["capture", "protocol", "method", *(heading for _, heading, _, _ in columns)]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    lines: list[Sequence[str]] = []
     for (capture, protocol), own in every.items():
         lines += _lines(capture, protocol, own, columns)
     methods = list(dict.fromkeys(row.method for row in rows))
@@ -96,7 +90,7 @@ def comparison_table(rows: Sequence[MethodRow]) -> str:
     if len(shared) > 1:
         means = [(method, _means(method, shared, columns)) for method in methods]
         lines += _lines(f"mean of {len(shared)}", "all", means, columns)
-    return "\n".join(lines) + "\n"
+    return markdown(["capture", "protocol", "method", *(heading for _, heading, _, _ in columns)], lines)
 
 
 def _means(
@@ -118,7 +112,7 @@ def _lines(
     protocol: str,
     rows: Sequence[tuple[str, dict[str, float | None]]],
     columns: Sequence[tuple[str, str, int, bool]],
-) -> list[str]:
+) -> list[Sequence[str]]:
     """Rows of one group. The best quality is bold if several rows have the figure."""
     best: dict[str, str] = {}
     for name, _, digits, higher in _QUALITY:
@@ -126,7 +120,7 @@ def _lines(
         if len(known) > 1:
             choose: Callable[[list[float]], float] = max if higher else min
             best[name] = f"{choose(known):.{digits}f}"
-    lines = []
+    lines: list[Sequence[str]] = []
     for index, (method, figures) in enumerate(rows):
         cells = []
         for name, _, digits, _ in columns:
@@ -134,5 +128,12 @@ def _lines(
             text = "-" if value is None else f"{value:,.{digits}f}"
             cells.append(f"**{text}**" if best.get(name) == text else text)
         first = (capture, protocol.replace("_", " ")) if index == 0 else ("", "")
-        lines.append(f"| {' | '.join((*first, method, *cells))} |")
+        lines.append((*first, method, *cells))
     return lines
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in markdown. Each line ends with a line break."""
+    lines = [" | ".join(heads), *(" | ".join(row) for row in rows)]
+    lines = [f"| {line} |" for line in lines]
+    return "\n".join([lines[0], "|" + "---|" * len(heads), *lines[1:]]) + "\n"

@@ -7,24 +7,15 @@ import torch
 from jaxtyping import Bool, Float
 
 from mien.lab.synthetic.truth import Truth
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.landmarks.groups import LEFT_LID_PAIRS, RIGHT_LID_PAIRS
 from mien.tracking.report.overlay import frontal_camera
 from mien.tracking.tracking import Tracking
 
 LIDS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS)
-"""MediaPipe's pairs of landmarks across the eyes' openings (`LIDS`), and of the eyes' corners (`_CORNERS`)."""
-_CORNERS = ((33, 133), (362, 263))
+"""MediaPipe's pairs of landmarks across the eyes' openings."""
 _MIN_BLINK = 0.25
 """Smallest decrease of an eye's opening in a blink, as a part of the median. A blink begins at half of it."""
-_MIN_FAST_SPEED = np.radians(15.0)
-"""Angular speed in radians per second from which a head turns fast."""
-_AROUND_SECONDS = 0.3
-"""Seconds before and after an event that belong to it."""
-_MAX_LAG, _LAG_STEP = 4.0, 0.05
-"""Largest lag and step of the search, in frames."""
-_MAX_STILL_SPEED = 0.02
-"""Speed in pixels per frame below which true landmarks stand still."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +34,22 @@ def following(
 ) -> Following | None:
     """Return lag and lost amplitude of k signals around events; None if there is no event.
 
-    Args:
-        tracked: Tracked signals. Events with values that are not finite are skipped.
-        true: True signals.
-        busy: Timesteps of events; each run of them is one event.
-        around: Timesteps before and after an event that belong to it.
+    Each run of `busy` timesteps is an event, to which `around` timesteps before and after belong. Events with tracked
+    values that are not finite are skipped.
     """
     windows = _windows(busy, around)
     parts = [part for part in windows if np.isfinite(tracked[part]).all() and part.stop - part.start > 2]
     if not parts:
         return None
-    lags = np.arange(-_MAX_LAG, _MAX_LAG + _LAG_STEP / 2, _LAG_STEP)
+    lags = np.arange(-4.0, 4.0 + 0.05 / 2, 0.05)
     sums = np.array([_products(tracked, true, parts, lag) for lag in lags])
     best = int((sums[:, 0] / np.sqrt(sums[:, 1] * sums[:, 2] + 1e-30)).argmax())
     return Following(float(lags[best]), float(100 * (1 - sums[best, 0] / max(sums[best, 2], 1e-30))), len(parts))
+
+
+def _around(fps: float) -> int:
+    """Timesteps before and after an event that belong to it: 0.3 s."""
+    return max(round(0.3 * fps), 2)
 
 
 def _windows(busy: Bool[np.ndarray, " t"], around: int) -> list[slice]:
@@ -69,10 +62,7 @@ def _windows(busy: Bool[np.ndarray, " t"], around: int) -> list[slice]:
 def _products(
     tracked: Float[np.ndarray, "t k"], true: Float[np.ndarray, "t k"], parts: list[slice], lag: float
 ) -> tuple[float, float, float]:
-    """Return sums of tracked x true, tracked squared and true squared.
-
-    The true signal is delayed, and each part's means are subtracted.
-    """
+    """Sums of tracked x true, tracked squared and true squared, of the delayed true signal, less each part's means."""
     time, sums = np.arange(len(true)), np.zeros(3)
     for part in parts:
         for x, y in zip(tracked.T, true.T, strict=True):
@@ -83,10 +73,7 @@ def _products(
 
 
 def _between(values: Float[np.ndarray, " t"], at: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Interpolate values at fractional timesteps by cubic convolution (Keys 1981).
-
-    Linear interpolation would flatten a blink.
-    """
+    """Interpolate values by cubic convolution (Keys 1981), since linear interpolation would flatten a blink."""
     at = np.clip(at, 0, len(values) - 1)
     first = np.floor(at).astype(int)
     x = at - first
@@ -103,7 +90,9 @@ def _between(values: Float[np.ndarray, " t"], at: Float[np.ndarray, " n"]) -> Fl
 def eye_opening(landmarks: Float[np.ndarray, "t l 2"]) -> Float[np.ndarray, " t"]:
     """Return the mean distance of the lids over the mean width of the eyes; about 0 when closed."""
     gaps = [np.linalg.norm(landmarks[:, upper] - landmarks[:, lower], axis=-1) for upper, lower in LIDS]
-    widths = [np.linalg.norm(landmarks[:, one] - landmarks[:, other], axis=-1) for one, other in _CORNERS]
+    widths = [
+        np.linalg.norm(landmarks[:, one] - landmarks[:, other], axis=-1) for one, other in ((33, 133), (362, 263))
+    ]
     return np.mean(gaps, axis=0) / np.mean(widths, axis=0)
 
 
@@ -118,7 +107,7 @@ def blink_following(
     if depth < _MIN_BLINK * middle:
         return None
     closing = opening < middle - max(0.5 * depth, 0.5 * _MIN_BLINK * middle)
-    return following(tracked[:, None], opening[:, None], closing, max(round(_AROUND_SECONDS * fps), 2))
+    return following(tracked[:, None], opening[:, None], closing, _around(fps))
 
 
 def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | None:
@@ -130,22 +119,21 @@ def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | 
     middle = mean_rotation(true)
     signals = [axis_angle_from_matrix(middle.T @ turns).numpy() for turns in (tracked @ steady, true)]
     speed = axis_angle_from_matrix(true[:-1].mT @ true[1:]).norm(dim=-1).numpy() * fps
-    fast = np.concatenate([speed > _MIN_FAST_SPEED, [False]])
-    return following(signals[0], signals[1], fast, max(round(_AROUND_SECONDS * fps), 2))
+    fast = np.concatenate([speed > np.radians(15.0), [False]])
+    return following(signals[0], signals[1], fast, _around(fps))
 
 
 def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor, "3 3"]:
     """Return the rotation nearest to the mean of the matrices."""
-    u, _, vh = torch.linalg.svd(rotations.double().mean(0))
-    sign = torch.ones(3, dtype=torch.float64)
-    sign[2] = torch.det(u @ vh)
-    return u @ torch.diag(sign) @ vh
+    nearest, _ = align_centered(np.eye(3), rotations.double().mean(0).T.numpy())
+    return torch.from_numpy(nearest)
 
 
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:
     """Return, for all timesteps but the first and the last, whether true landmarks stand still around them."""
     moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
-    return (moving[1:] < _MAX_STILL_SPEED) & (moving[:-1] < _MAX_STILL_SPEED)
+    still = moving < 0.02  # pixels a frame
+    return still[1:] & still[:-1]
 
 
 def jitter(points: Float[np.ndarray, "t *l d"], still: Bool[np.ndarray, " t2"]) -> float | None:

@@ -1,7 +1,4 @@
-"""Measure a `headgas` training step, as `mien train` runs it, and a frame at a changing expression.
-
-Run as `mien bench train-step --method headgas`.
-"""
+"""Measure a `headgas` training step, as `mien train` runs it, and a frame at a changing expression."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,31 +6,18 @@ from itertools import count as counting
 
 import torch
 
-from mien import _native, runtime
+from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.lab.benchmarking.render import thread_counts
-from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
-from mien.lab.benchmarking.train_step import (
-    SETTINGS,
-    TIMESTEPS,
-    benchmark_sequence,
-    empty_statistics,
-    paint_targets,
-    pose_and_render,
-    runtime_frame,
-)
+from mien.lab.benchmarking import train_step
+from mien.lab.benchmarking.timing import BenchmarkRow, rows_by_threads
 from mien.training.checkpoint import TrainingState
-from mien.training.footage.frames import FrameOrder, training_frames
-from mien.training.footage.sequence import Targets
-from mien.training.trainer import TrainingData, start, step
+from mien.training.trainer import TrainingData, start
 
-COUNT, SIZE = 30_000, (512, 512)
-POINTS = 3_000
-"""Number of points on the mesh, of which the Gaussians are copies nearby."""
+_COUNT, _SIZE = 30_000, (512, 512)
 
 
 def headgas_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
@@ -46,38 +30,34 @@ def headgas_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
     config = HeadGasConfig(features=32, sh_degree=3)
     face_model = load_face_model()
     for name, directions in (("headgas_step", config.directions), ("headgas_step_all", 0)):
-        state, data = headgas_case(face_model, replace(config, directions=directions), COUNT, SIZE)
-        for threads in thread_counts():
-            _native.set_thread_count(threads)
-            timing = time_function(lambda state=state, data=data: step(state, data, SETTINGS), seconds)
-            yield benchmark_row(name, COUNT, SIZE, timing)
-    state, data = headgas_case(face_model, config, COUNT, SIZE)
+        state, data = headgas_case(face_model, replace(config, directions=directions), _COUNT, _SIZE)
+        yield from train_step.step_rows(name, _COUNT, _SIZE, state, data, seconds)
+    state, data = headgas_case(face_model, config, _COUNT, _SIZE)
     camera, face, frames = data.targets[0].camera(0), state.track.params(), counting()
     portable = runtime.Avatar(make_portable(state.avatar, camera, "benchmark"))
-    for threads in thread_counts():
-        _native.set_thread_count(threads)
-        timing = time_function(
-            lambda: pose_and_render(state.avatar, face[next(frames) % TIMESTEPS], camera), seconds / 3
-        )
-        yield benchmark_row("headgas_frame", COUNT, SIZE, timing)
-        timing = time_function(lambda: runtime_frame(portable, face[next(frames) % TIMESTEPS]), seconds / 3)
-        yield benchmark_row("headgas_runtime_frame", COUNT, SIZE, timing)
+    for name, draw in (
+        ("headgas_frame", lambda face: train_step.pose_and_render(state.avatar, face, camera)),
+        ("headgas_runtime_frame", lambda face: train_step.runtime_frame(portable, face)),
+    ):
+        frame = lambda draw=draw: draw(face[next(frames) % train_step.TIMESTEPS])  # noqa: E731
+        yield from rows_by_threads(name, _COUNT, _SIZE, frame, seconds / 3)
 
 
 def headgas_case(
     face_model: FaceModel, config: HeadGasConfig, count: int, size: tuple[int, int]
 ) -> tuple[TrainingState, TrainingData]:
-    """Return a state in the middle of a run with `count` Gaussians, and its pictures of (width, height) `size`."""
-    sequence = benchmark_sequence(face_model, *size)
-    state = start([sequence], face_model, replace(config, points=POINTS), SETTINGS)
-    avatar = state.avatar
-    assert isinstance(avatar, HeadGas)
-    _fill(avatar, count)
+    """Return a state in the middle of a run with `count` Gaussians, and its pictures of (width, height) `size`.
+
+    The Gaussians are copies of 3,000 points on the mesh, nearby.
+    """
+    sequence = train_step.benchmark_sequence(face_model, *size)
+    state = start([sequence], face_model, replace(config, points=3_000), train_step.SETTINGS)
+    assert isinstance(state.avatar, HeadGas)
+    _fill(state.avatar, count)
     assert state.density is not None
-    state.density.load_state(empty_statistics(count))
-    paint_targets(sequence, avatar, torch.zeros(()))
-    order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
-    return state, TrainingData(order, (Targets(sequence, 0),))
+    state.density.load_state(train_step.empty_statistics(count))
+    train_step.paint_targets(sequence, state.avatar)
+    return state, train_step.case_data(sequence)
 
 
 @torch.no_grad()

@@ -1,31 +1,23 @@
-"""Measure a `mono_gaussian_avatar` training step, as `mien train` runs it, and a frame of the baked avatar.
-
-Run as `mien bench train-step --method mono_gaussian_avatar`.
-"""
+"""Measure a `mono_gaussian_avatar` training step, as `mien train` runs it, and a frame of the baked avatar."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count as counting
 
 import torch
 
-from mien import _native, runtime
+from mien import runtime
 from mien.avatar.baking import make_portable
 from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.lab.benchmarking.render import thread_counts
-from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
-from mien.lab.benchmarking.train_step import SETTINGS, TIMESTEPS, benchmark_sequence, paint_targets, runtime_frame
+from mien.lab.benchmarking import train_step
+from mien.lab.benchmarking.timing import BenchmarkRow, rows_by_threads
 from mien.training.checkpoint import TrainingState
-from mien.training.footage.frames import FrameOrder, training_frames
-from mien.training.footage.sequence import Targets
-from mien.training.trainer import TrainingData, start, step
+from mien.training.trainer import TrainingData, start
 
-COUNT, FRAME_COUNT, SIZE = 10_000, 30_000, (512, 512)
-FRAMES_PER_STEP = (1, 2, 4, 8)
-_LATE_STEP = round(0.9 * SETTINGS.steps) + 1
-"""A step late in the run, when radii are small. No round of density control is near it."""
+_SIZE = (512, 512)
 
 
 def mono_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
@@ -34,24 +26,25 @@ def mono_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
     Times of a step are divided by its number of frames.
     """
     face_model = load_face_model()
-    for frames in FRAMES_PER_STEP:
-        state, data = mono_case(face_model, COUNT, SIZE, frames)
-        for threads in thread_counts():
-            _native.set_thread_count(threads)
-            timing = time_function(lambda state=state, data=data: step(state, data, SETTINGS), seconds)
-            yield benchmark_row(f"mono_step_{frames}_frames", COUNT, SIZE, per_frame(timing, frames))
-    late, others = mono_case(face_model, FRAME_COUNT, SIZE)
-    camera, face, frames = others.targets[0].camera(0), late.track.params(), counting()
-    portable = runtime.Avatar(make_portable(late.avatar, camera, "benchmark"))
-    for threads in thread_counts():
-        _native.set_thread_count(threads)
-        timing = time_function(lambda: runtime_frame(portable, face[next(frames) % TIMESTEPS]), seconds / 3)
-        yield benchmark_row("mono_runtime_frame", FRAME_COUNT, SIZE, timing)
+    for count in (1, 2, 4, 8):
+        case = mono_case(face_model, 10_000, _SIZE, count)
+        for row in train_step.step_rows(f"mono_step_{count}_frames", 10_000, _SIZE, *case, seconds):
+            yield per_frame(row, count)
+    state, data = mono_case(face_model, 30_000, _SIZE)
+    camera, face, frames = data.targets[0].camera(0), state.track.params(), counting()
+    portable = runtime.Avatar(make_portable(state.avatar, camera, "benchmark"))
+    yield from rows_by_threads(
+        "mono_runtime_frame",
+        30_000,
+        _SIZE,
+        lambda: train_step.runtime_frame(portable, face[next(frames) % train_step.TIMESTEPS]),
+        seconds / 3,
+    )
 
 
-def per_frame(timing: Timing, frames: int) -> Timing:
+def per_frame(row: BenchmarkRow, frames: int) -> BenchmarkRow:
     """The times of one of a step's frames."""
-    return Timing(timing.min_ms / frames, timing.median_ms / frames, timing.cpu_ms / frames)
+    return replace(row, min_ms=row.min_ms / frames, median_ms=row.median_ms / frames, cpu_ms=row.cpu_ms / frames)
 
 
 def mono_case(
@@ -61,17 +54,17 @@ def mono_case(
 
     Steps use `frames` frames.
     """
-    sequence = benchmark_sequence(face_model, *size)
+    sequence = train_step.benchmark_sequence(face_model, *size)
     config = MonoGaussianAvatarConfig(points=len(face_model.template), frames_per_step=frames)
-    state = start([sequence], face_model, config, SETTINGS)
+    state = start([sequence], face_model, config, train_step.SETTINGS)
     assert isinstance(state.avatar, MonoGaussianAvatar)
     _fill(state.avatar, count)
-    state.step = _LATE_STEP
+    # Late in the run radii are small, and no round of density control is near.
+    state.step = round(0.9 * train_step.SETTINGS.steps) + 1
     assert state.density is not None
     state.density.load_state({"opacity": torch.zeros(count)})
-    paint_targets(sequence, state.avatar, torch.zeros(()))
-    order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
-    return state, TrainingData(order, (Targets(sequence, 0),))
+    train_step.paint_targets(sequence, state.avatar)
+    return state, train_step.case_data(sequence)
 
 
 @torch.no_grad()

@@ -1,6 +1,6 @@
 """Errors of a tracking against the truth of a synthetic capture, and rows and tables of `mien bench quality`."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
+from mien.lab.benchmarking.comparing import markdown
 from mien.lab.benchmarking.following import (
     Following,
     blink_following,
@@ -18,12 +19,10 @@ from mien.lab.benchmarking.following import (
     turn_following,
 )
 from mien.lab.synthetic.truth import Truth
+from mien.machine import exact
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.report.residuals import residual_report
 from mien.tracking.tracking import Tracking
-
-_MIN_FACING = 0.2
-"""Smallest cosine between a visible vertex's normal and the direction to the camera."""
 
 
 @dataclass(frozen=True)
@@ -109,25 +108,20 @@ def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray,
 
 
 def visible_vertices(truth: Truth, face_model: FaceModel, timestep: int) -> Bool[np.ndarray, " n"]:
-    """Mark the region's vertices that face any camera."""
+    """Mark the region's vertices that face any camera: the cosine between normal and direction is above 0.2."""
     index, faces = truth.vertex_index, face_model.faces.numpy()
     place = np.full(len(face_model.template), -1)
     place[index] = np.arange(len(index))
     local = place[faces]
     local = local[(local >= 0).all(1)]
     points = truth.vertices[timestep]
-    corners = points[local]
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(points)
-    for corner in range(3):
-        np.add.at(normals, local[:, corner], areas)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12
+    normals = exact.vertex_normals(points, local)
     pose = truth.tracking.face.T_world_head[timestep].numpy()
     facing = np.zeros(len(index), bool)
     for camera in truth.tracking.cameras:
         towards = pose[:3, :3].T @ (camera.position.numpy() - pose[:3, 3]) - points
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
-        facing |= (normals * towards).sum(-1) > _MIN_FACING
+        facing |= (normals * towards).sum(-1) > 0.2
     return facing
 
 
@@ -165,61 +159,53 @@ class QualityRow:
     unseen_views_by_truth: dict[str, Any] = field(default_factory=dict)
     """The same for a run that was trained and posed by the true tracking, which leaves what the avatar itself costs."""
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the row as a json object."""
-        return asdict(self)
-
 
 def markdown_table(rows: list[QualityRow]) -> str:
     """Return tables of pictures and trackings, in the form of docs/results.md."""
-    lines = [
-        "| capture (key) | protocol | what | whole frame: PSNR / SSIM / L1 / ST-LPIPS | head crop |",
-        "|---|---|---|---|---|",
-    ]
+    pictures = []
     for row in rows:
         for protocol, entry in row.protocols.items():
-            named = {"avatar": entry, **entry["baselines"]}
-            for what, figures in named.items():
-                label = f"{row.capture} (`{row.key}`)" if what == "avatar" else ""
-                lines.append(f"| {label} | {protocol if what == 'avatar' else ''} | {what.replace('_', ' ')} | "
-                             f"{_figures(figures)} | {_figures(figures['head'])} |")  # fmt: skip
-    lines += [
-        "",
-        "| capture | sequence | face vertices | landmarks | head rotation (steady part left out) | jitter, still | "
-        "blinks: lag, loss | fast turns: lag, loss | iris distance |",
-        "|---|---|---|---|---|---|---|---|---|",
+            for what, figures in {"avatar": entry, **entry["baselines"]}.items():
+                label = (f"{row.capture} (`{row.key}`)", protocol) if what == "avatar" else ("", "")
+                pictures.append((*label, what.replace("_", " "), _figures(figures), _figures(figures["head"])))
+    tables = [
+        markdown(
+            ("capture (key)", "protocol", "what", "whole frame: PSNR / SSIM / L1 / ST-LPIPS", "head crop"), pictures
+        ),
+        markdown(
+            ("capture", "sequence", "face vertices", "landmarks", "head rotation (steady part left out)",
+             "jitter, still", "blinks: lag, loss", "fast turns: lag, loss", "iris distance"),
+            [(row.capture, name, *tracking_cells(errors)) for row in rows for name, errors in row.tracking.items()],
+        ),
+    ]  # fmt: skip
+    for row in rows:
+        views = {row.capture: row.unseen_views, f"{row.capture}, true tracking": row.unseen_views_by_truth}
+        tables += [unseen_table(name, figures) for name, figures in views.items() if figures]
+    seconds = [", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items()) for row in rows]
+    spent = [
+        (row.capture, f"{row.steps:,}", f"{row.gaussians:,}", told) for row, told in zip(rows, seconds, strict=True)
     ]
-    for row in rows:
-        lines += [f"| {row.capture} | {name} | {tracking_cells(errors)} |" for name, errors in row.tracking.items()]
-    for row in rows:
-        lines += ["", *unseen_lines(row.capture, row.unseen_views)] if row.unseen_views else []
-        truth = unseen_lines(f"{row.capture}, true tracking", row.unseen_views_by_truth)
-        lines += ["", *truth] if row.unseen_views_by_truth else []
-    lines += ["", "| capture | steps | Gaussians | seconds by stage |", "|---|---|---|---|"]
-    for row in rows:
-        seconds = ", ".join(f"{name} {value:.0f}" for name, value in row.seconds.items())
-        lines.append(f"| {row.capture} | {row.steps:,} | {row.gaussians:,} | {seconds} |")
-    return "\n".join(lines) + "\n"
+    tables.append(markdown(("capture", "steps", "Gaussians", "seconds by stage"), spent))
+    return "\n".join(tables)
 
 
-def unseen_lines(name: str, views: dict[str, Any]) -> list[str]:
-    """Return a table of the head crop by angle in markdown, line by line."""
-    lines = [
-        f"| {name}: degrees to the side | avatar: PSNR / SSIM / ST-LPIPS of the head crop "
-        "| mesh in completed colours |",
-        "|---|---|---|",
-    ]
+def unseen_table(name: str, views: dict[str, Any]) -> str:
+    """A table of the head crop by angle."""
+    heads = [
+        f"{name}: degrees to the side", "avatar: PSNR / SSIM / ST-LPIPS of the head crop", "mesh in completed colours"
+    ]  # fmt: skip
+    rows = []
     for angle, row in views.items():
-        heads = [row[what]["head"] for what in ("avatar", "mesh")]
-        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {_known(head['perceptual'], '{:.3f}')}" for head in heads]
-        lines.append(f"| {angle} | {' | '.join(cells)} |")
-    return lines
+        crops = [row[what]["head"] for what in ("avatar", "mesh")]
+        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {_known(head['perceptual'], '{:.3f}')}" for head in crops]
+        rows.append((angle, *cells))
+    return markdown(heads, rows)
 
 
-def tracking_cells(errors: TrackingErrors) -> str:
+def tracking_cells(errors: TrackingErrors) -> list[str]:
     """Return the figures of one sequence as cells of a table."""
     pixels, world = _known(errors.jitter_px, "{:.3f} px"), _known(errors.jitter_mm, "{:.3f} mm")
-    return " | ".join([
+    return [
         f"{errors.vertex_mm:.2f} mm", f"{errors.landmark_px:.2f} px",
         f"{errors.rotation_deg:.2f} ({errors.rotation_steady_deg:.2f}) deg",
         pixels if errors.jitter_mm is None else f"{pixels}, {world}",
@@ -228,7 +214,7 @@ def tracking_cells(errors: TrackingErrors) -> str:
             for one in (errors.blinks, errors.turns)
         ),
         _known(errors.iris_deviation_percent, "{:.2f} %"),
-    ])  # fmt: skip
+    ]  # fmt: skip
 
 
 def _known(value: float | None, form: str) -> str:
@@ -236,6 +222,5 @@ def _known(value: float | None, form: str) -> str:
 
 
 def _figures(entry: dict[str, Any]) -> str:
-    perceptual = entry.get("perceptual")
-    last = "-" if perceptual is None else f"{perceptual:.3f}"
+    last = _known(entry.get("perceptual"), "{:.3f}")
     return f"{entry['psnr']:.2f} / {entry['ssim']:.3f} / {entry['l1']:.4f} / {last}"

@@ -1,77 +1,142 @@
-"""Measure how fast the native rasterizer renders a synthetic head that fills half of the picture.
+"""Measure how fast a synthetic head that fills half of the picture is rendered (`mien bench render` and `scaling`)."""
 
-Run as `mien bench render` (two sizes, every instruction set) and `mien bench scaling` (sizes of the papers).
-"""
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from collections.abc import Iterator
-
+import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mien import _native
-from mien.lab.benchmarking.scenes import Scene, head_scene
-from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, time_function
+from mien.camera import Camera
+from mien.gaussians import Gaussians
+from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, rows_by_threads, time_function
+from mien.machine.terminal import counted
+from mien.pages.plots import Axes, Series, write_chart
 from mien.render import rasterize
-from mien.render.rasterize import Backend
 
 COUNTS = (10_000, 30_000, 100_000, 300_000)
-SIZES = {
-    "HeadGaS's figure": (512, 512),
-    "GaussianAvatars' table": (550, 802),
-    "": (1024, 1024),
-    "large": (2048, 2048),
-}
+PAPER_SIZES = {"HeadGaS's figure": (512, 512), "GaussianAvatars' table": (550, 802)}
 """Width and height in pixels (the papers' 802x550 is height x width), by where that size is reported."""
-INSTRUCTION_SETS = ("avx512", "avx2", "sse4", "baseline")
+SIZES = (*PAPER_SIZES.values(), (1024, 1024), (2048, 2048))
+GPU_COUNTS = (30_000, 100_000)
 
 
-def draw(scene: Scene, backend: Backend = "native") -> None:
-    """Render one picture without gradients."""
-    with torch.no_grad():
-        rasterize(scene.gaussians, scene.camera, scene.background, backend)
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Gaussians whose tensors are leaves, a camera, and a gradient of the picture for backward passes."""
+
+    gaussians: Gaussians
+    camera: Camera
+    background: Float[Tensor, " 3"]
+    gradient: Float[Tensor, "h w 3"]
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The tensors whose gradients are computed."""
+        own = self.gaussians
+        return [own.means, own.quats, own.scales, own.opacities, own.sh]
+
+    def draw(self) -> None:
+        """Render one picture without gradients."""
+        with torch.no_grad():
+            rasterize(self.gaussians, self.camera, self.background)
+
+    def draw_and_differentiate(self) -> None:
+        """Render one picture and compute the gradients of all parameters."""
+        picture = rasterize(self.gaussians, self.camera, self.background).image
+        torch.autograd.grad(picture, self.parameters, self.gradient)
 
 
-def draw_and_differentiate(scene: Scene, backend: Backend = "native") -> None:
-    """Render one picture and compute the gradients of all parameters."""
-    picture = rasterize(scene.gaussians, scene.camera, scene.background, backend).image
-    torch.autograd.grad(picture, scene.parameters, scene.gradient)
+def synthetic_head(count: int, coefficients: int = 1) -> Gaussians:
+    """Cover an ellipsoid with small, mostly opaque splats. Their total area does not depend on their number."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    spread = torch.exp(0.35 * torch.randn(count, 3, generator=generator))
+    return Gaussians(
+        means=directions * torch.tensor([0.085, 0.11, 0.095]),
+        quats=torch.randn(count, 4, generator=generator),
+        scales=spread * 0.00056 * (30000 / count) ** 0.5,
+        opacities=torch.sigmoid(2 + 1.5 * torch.randn(count, generator=generator)),
+        sh=0.3 * torch.randn(count, coefficients, 3, generator=generator),
+    )
 
 
-def benchmark_render(count: int, size: tuple[int, int], threads: int, seconds: float = 0.8) -> list[BenchmarkRow]:
-    """Measure forward alone, and forward with backward, of one picture. This changes the number of native threads."""
-    _native.set_thread_count(threads)
+def head_camera(width: int, height: int) -> Camera:
+    """Return a camera 60 cm in front of the head, whose height is three quarters of the picture's shorter side."""
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 0.6
+    focal = 2.35 * min(width, height)
+    return Camera(torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), viewmat, width, height)
+
+
+def head_scene(count: int, width: int, height: int, like: Tensor | None = None) -> Scene:
+    """Return the head over white, with the float dtype and the device of `like` (None: float32 on the CPU)."""
+    head, like = synthetic_head(count), torch.zeros(()) if like is None else like
+    names = ("means", "quats", "scales", "opacities", "sh")
+    head = replace(head, **{name: getattr(head, name).to(like).requires_grad_() for name in names})
+    gradient = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(1))
+    return Scene(head, head_camera(width, height).to(like), like.new_ones(3), gradient.to(like))
+
+
+def drawing_rows(count: int, size: tuple[int, int], seconds: float) -> Iterator[BenchmarkRow]:
+    """Measure forward alone, and forward with backward, of one picture, by threads."""
     scene = head_scene(count, *size)
-    forward = time_function(lambda: draw(scene), seconds)
-    both = time_function(lambda: draw_and_differentiate(scene), seconds)
-    return [
-        benchmark_row("rasterize_forward", count, size, forward),
-        benchmark_row("rasterize_forward_backward", count, size, both),
-    ]
+    yield from rows_by_threads("rasterize_forward", count, size, scene.draw, seconds)
+    yield from rows_by_threads("rasterize_forward_backward", count, size, scene.draw_and_differentiate, seconds)
 
 
 def render_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
     """Measure 10,000 to 100,000 Gaussians at two sizes by threads, then 30,000 at 512x512 by instruction set."""
     for count in COUNTS[:3]:
         for size in ((512, 512), (1024, 1024)):
-            for threads in thread_counts():
-                yield from benchmark_render(count, size, threads, seconds)
-    best = _native.rasterize_isa()
+            yield from drawing_rows(count, size, seconds)
+    best, scene = _native.rasterize_isa(), head_scene(30_000, 512, 512)
+    _native.set_thread_count(1)
     try:
-        for isa in INSTRUCTION_SETS:
+        for isa in ("avx512", "avx2", "sse4", "baseline"):
             if _native.set_rasterize_isa(isa):
-                yield from benchmark_render(30_000, (512, 512), 1, seconds)
+                for name, work in (("forward", scene.draw), ("forward_backward", scene.draw_and_differentiate)):
+                    yield benchmark_row(f"rasterize_{name}", 30_000, (512, 512), time_function(work, seconds))
     finally:
         _native.set_rasterize_isa(best)
 
 
 def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
     """Measure 10,000 to 300,000 Gaussians at the papers' sizes and up to 2048x2048, by threads."""
-    for size in SIZES.values():
+    for size in SIZES:
         for count in COUNTS:
-            for threads in thread_counts():
-                yield from benchmark_render(count, size, threads, seconds)
+            yield from drawing_rows(count, size, seconds)
 
 
-def thread_counts() -> list[int]:
-    """Return one thread, and all threads that `MIEN_THREADS` or the machine allows."""
-    _native.set_thread_count(0)
-    return sorted({1, _native.thread_count()})
+def gpu_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
+    """Measure the same on the device of `like`, at the papers' sizes."""
+    for count in GPU_COUNTS:
+        for size in PAPER_SIZES.values():
+            scene = head_scene(count, *size, like)
+            for name, work in (("forward", scene.draw), ("forward_backward", scene.draw_and_differentiate)):
+                timing = time_function(work, seconds, like=like)
+                yield benchmark_row(f"rasterize_{name}", count, size, timing, like)
+
+
+def write_scaling_chart(path: Path, rows: Sequence[BenchmarkRow]) -> None:
+    """Write a .svg of milliseconds over the number of Gaussians: a chart per kind of row, a line per size."""
+    charts = []
+    for name, threads in dict.fromkeys((row.name, row.threads) for row in rows):
+        own = [row for row in rows if (row.name, row.threads) == (name, threads)]
+        sizes, styles = dict.fromkeys((row.width, row.height) for row in own), ("main", "second", "third", "fourth")
+        lines = [[row for row in own if (row.width, row.height) == size] for size in sizes]
+        series = [
+            Series(
+                f"{line[0].width}x{line[0].height}",
+                np.array([row.gaussians for row in line], np.float64),
+                np.array([row.min_ms for row in line]),
+                style,
+            )
+            for line, style in zip(lines, styles, strict=False)
+        ]
+        title = f"{name.replace('_', ' ')}, {counted(threads, 'thread')}"
+        charts.append((title, series, Axes("Gaussians", "milliseconds (minimum)", 640, 320, logarithmic=True)))
+    write_chart(path, charts)

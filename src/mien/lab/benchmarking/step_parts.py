@@ -1,7 +1,6 @@
-"""Measure the parts of a training step of the default: whole heads, features, and all losses.
+"""Measure the parts of a training step of the default method (`mien bench train-step --parts`).
 
-Run as `mien bench train-step --parts`. The steps are those of `mien train`, on a drawn head that needs no footage. Each
-native operation has a row of its own. What remains of a phase is the work of Python and PyTorch in it.
+Each native operation has a row of its own. What remains of a phase is the work of Python and PyTorch in it.
 """
 
 import time
@@ -17,10 +16,11 @@ from mien import _native
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.lab.benchmarking.render import thread_counts
+from mien.lab.benchmarking.timing import thread_counts
 from mien.lab.benchmarking.train_step import (
     TIMESTEPS,
     benchmark_sequence,
+    case_data,
     empty_statistics,
     paint_targets,
     training_case,
@@ -28,8 +28,6 @@ from mien.lab.benchmarking.train_step import (
 from mien.machine.terminal import counted
 from mien.training import trainer
 from mien.training.checkpoint import TrainingState
-from mien.training.footage.frames import FrameOrder, training_frames
-from mien.training.footage.sequence import Targets
 from mien.training.settings import PRESETS, TrainSettings, resolved
 from mien.training.trainer import TrainingData, start, step
 
@@ -38,8 +36,6 @@ COUNT, SIZE = 45_000, (512, 512)
 ROUND = 48
 """Number of steps that are measured together: rare losses are due in the same number of them each time."""
 REST = "Python and PyTorch"
-_STEPS, _BEGUN = 10_000_000, 6_000_000
-"""Length of the run, and the step at which it is measured: all losses have begun, and no density control is due."""
 _PHASES: dict[str, tuple[Any, str]] = {
     "frame": (trainer, "next_batch"),
     "pose and draw": (trainer, "draw"),
@@ -80,12 +76,7 @@ class Stopwatch:
 
     def phase(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return `function`, whose time belongs to a phase."""
-
-        def call(*arguments: Any, **named: Any) -> Any:
-            with self._running((name, REST)):
-                return function(*arguments, **named)
-
-        return call
+        return lambda *arguments, **named: self._timed((name, REST), function, arguments, named)
 
     def operation(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return `function`, whose time belongs to an operation of the phase that calls it, if there is one."""
@@ -93,17 +84,15 @@ class Stopwatch:
         def call(*arguments: Any, **named: Any) -> Any:
             if not self._open:
                 return function(*arguments, **named)
-            with self._running((self._open[-1][0], name)):
-                return function(*arguments, **named)
+            return self._timed((self._open[-1][0], name), function, arguments, named)
 
         return call
 
-    @contextmanager
-    def _running(self, key: tuple[str, str]) -> Iterator[None]:
+    def _timed(self, key: tuple[str, str], function: Callable[..., Any], arguments: Any, named: Any) -> Any:
         self._tick()
         self._open.append(key)
         try:
-            yield
+            return function(*arguments, **named)
         finally:
             self._tick()
             self._open.pop()
@@ -169,17 +158,15 @@ def default_case(
     One camera films the head, so sides are filled. Every trained Gaussian has features.
     """
     preset = PRESETS["standard"]
-    settings = replace(preset.settings_of(DEFAULT_METHOD), steps=_STEPS, split="none")
+    settings = replace(preset.settings_of(DEFAULT_METHOD), steps=10_000_000, split="none")
     sequence = benchmark_sequence(face_model, *size)
     painter, _ = training_case(face_model, len(face_model.faces), *size)
-    paint_targets(sequence, painter.avatar, torch.zeros(()))
+    paint_targets(sequence, painter.avatar)
     state = start([sequence], face_model, preset.config(DEFAULT_METHOD), settings)
     settings = resolved(settings, filled=state.head is not None and state.head.fills)
     _grow(state, count)
-    state.step = _BEGUN
-    order = FrameOrder(training_frames([sequence], settings), seed=0)
-    targets = Targets(sequence, 0, cleaned=True)
-    return state, TrainingData(order, (targets,)), settings
+    state.step = 6_000_000  # All losses have begun, and no density control is due.
+    return state, case_data(sequence, settings), settings
 
 
 def _grow(state: TrainingState, count: int) -> None:

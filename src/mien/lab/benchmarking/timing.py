@@ -3,8 +3,8 @@
 import os
 import platform
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -57,34 +57,56 @@ class Machine:
     """Name of the GPU, torch's CUDA version and gsplat's version, if the GPU is measured."""
 
 
-def time_function(function: Callable[[], object], seconds: float = 0.8, min_runs: int = 7) -> Timing:
-    """Time a function for about `seconds` and at least `min_runs` runs, after two warm-up runs."""
-    for _ in range(2):
+def time_function(
+    function: Callable[[], object], seconds: float = 0.8, min_runs: int = 7, like: Tensor | None = None
+) -> Timing:
+    """Time a function for about `seconds` and at least `min_runs` runs, after two warm-up runs.
+
+    If `like` is on a GPU, a run ends when the GPU has finished it.
+    """
+
+    def run() -> None:
         function()
+        if like is not None and like.is_cuda:
+            torch.cuda.synchronize(like.device)
+
+    for _ in range(2):
+        run()
     walls: list[float] = []
     processors: list[float] = []
     end = time.perf_counter() + seconds
     while len(walls) < min_runs or time.perf_counter() < end:
         processor, wall = time.process_time(), time.perf_counter()
-        function()
+        run()
         walls.append(1e3 * (time.perf_counter() - wall))
         processors.append(1e3 * (time.process_time() - processor))
     return Timing(min(walls), sorted(walls)[len(walls) // 2], min(processors))
 
 
-def benchmark_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing) -> BenchmarkRow:
-    """Return a row with the threads and the instruction set in use; `size` is (width, height)."""
-    width, height = size
+def benchmark_row(
+    name: str, gaussians: int, size: tuple[int, int], timing: Timing, like: Tensor | None = None
+) -> BenchmarkRow:
+    """A row on the device of `like` (None for the CPU), with the threads in use; `size` is (width, height)."""
+    on_gpu = like is not None and like.is_cuda
+    threads, isa = (0, "cuda") if on_gpu else (_native.thread_count(), _native.rasterize_isa())
     return BenchmarkRow(
-        **asdict(timing), name=name, gaussians=gaussians, width=width, height=height,
-        threads=_native.thread_count(), isa=_native.rasterize_isa(),
-    )  # fmt: skip
+        **asdict(timing), name=name, gaussians=gaussians, width=size[0], height=size[1], threads=threads, isa=isa
+    )
 
 
-def device_row(name: str, gaussians: int, size: tuple[int, int], timing: Timing, like: Tensor) -> BenchmarkRow:
-    """Return a row of a run on the device of `like`; `size` is (width, height)."""
-    row = benchmark_row(name, gaussians, size, timing)
-    return replace(row, threads=0, isa=like.device.type) if like.is_cuda else row
+def thread_counts() -> list[int]:
+    """Return one thread, and all threads that `MIEN_THREADS` or the machine allows."""
+    _native.set_thread_count(0)
+    return sorted({1, _native.thread_count()})
+
+
+def rows_by_threads(
+    name: str, gaussians: int, size: tuple[int, int], function: Callable[[], object], seconds: float
+) -> Iterator[BenchmarkRow]:
+    """Time a function with one thread and with all. This changes the number of native threads."""
+    for threads in thread_counts():
+        _native.set_thread_count(threads)
+        yield benchmark_row(name, gaussians, size, time_function(function, seconds))
 
 
 def measure_machine(gpu: bool = False) -> Machine:

@@ -1,7 +1,4 @@
-"""Measure a `gaussian_avatars` training step, as `mien train` runs it, on a sequence that needs no footage.
-
-Run as `mien bench train-step`.
-"""
+"""Measure a `gaussian_avatars` training step, as `mien train` runs it, on a sequence that needs no footage."""
 
 import time
 from collections.abc import Iterator
@@ -11,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mien import _native, runtime
+from mien import runtime
 from mien.avatar.avatar import Avatar
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.camera import Camera
@@ -19,8 +16,8 @@ from mien.capture.capture import Capture
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.lab.benchmarking.render import thread_counts
-from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, time_function
+from mien.lab.benchmarking.render import GPU_COUNTS, PAPER_SIZES
+from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, rows_by_threads, time_function
 from mien.render import rasterize
 from mien.tracking.tracking import Tracking
 from mien.training.batch import targets_ahead
@@ -42,19 +39,33 @@ def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
     """Measure whole steps at 512x512 by Gaussians and threads, and posing with rendering at the papers' sizes."""
     for count in (10_000, 30_000, 100_000):
         state, data = training_case(load_face_model(), count, 512, 512)
-        for threads in thread_counts():
-            _native.set_thread_count(threads)
-            timing = time_function(lambda state=state, data=data: step(state, data, SETTINGS), seconds)
-            yield benchmark_row("train_step", count, (512, 512), timing)
-    for count, (width, height) in ((30_000, (512, 512)), (100_000, (550, 802))):
-        state, data = training_case(load_face_model(), count, width, height)
-        face = state.track.params()
-        for threads in thread_counts():
-            _native.set_thread_count(threads)
-            scene = (state.avatar, face, data.targets[0].camera(0))
-            timing = time_function(lambda scene=scene: pose_and_render(*scene), seconds / 3)
-            yield benchmark_row("pose_and_render", count, (width, height), timing)
+        yield from step_rows("train_step", count, (512, 512), state, data, seconds)
+    for count, size in ((30_000, (512, 512)), (100_000, (550, 802))):
+        state, data = training_case(load_face_model(), count, *size)
+        scene = (state.avatar, state.track.params(), data.targets[0].camera(0))
+        yield from rows_by_threads(
+            "pose_and_render", count, size, lambda scene=scene: pose_and_render(*scene), seconds / 3
+        )
     yield from waiting_rows(load_face_model(), 30_000, (550, 802), seconds / 3)
+
+
+def gpu_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
+    """Measure whole steps, and posing with rendering, on the device of `like` at the papers' sizes."""
+    for count in GPU_COUNTS:
+        for size in PAPER_SIZES.values():
+            state, data = training_case(load_face_model(), count, *size, like)
+            timing = time_function(lambda state=state, data=data: step(state, data, SETTINGS), seconds, like=like)
+            yield benchmark_row("train_step", count, size, timing, like)
+            scene = (state.avatar, state.track.params(), data.targets[0].camera(0))
+            timing = time_function(lambda scene=scene: pose_and_render(*scene), seconds / 3, like=like)
+            yield benchmark_row("pose_and_render", count, size, timing, like)
+
+
+def step_rows(
+    name: str, count: int, size: tuple[int, int], state: TrainingState, data: TrainingData, seconds: float
+) -> Iterator[BenchmarkRow]:
+    """Measure whole steps of a case by threads."""
+    return rows_by_threads(name, count, size, lambda: step(state, data, SETTINGS), seconds)
 
 
 def waiting_rows(face_model: FaceModel, count: int, size: tuple[int, int], seconds: float) -> Iterator[BenchmarkRow]:
@@ -94,21 +105,24 @@ def runtime_frame(avatar: runtime.Avatar, face: FaceParams) -> None:
 def training_case(
     face_model: FaceModel, count: int, width: int, height: int, like: Tensor = _ON_CPU
 ) -> tuple[TrainingState, TrainingData]:
-    """Return a state in the middle of a run with `count` Gaussians, and its pictures.
-
-    The head covers half of each picture.
+    """Return a state in the middle of a run with `count` Gaussians, and its pictures, half of which the head covers.
 
     Both have the float dtype and the device of `like`.
     """
     sequence = benchmark_sequence(face_model, width, height)
     state = start([sequence], face_model, as_published(), SETTINGS, like)
     _grow(state.avatar, count)
-    order = FrameOrder(training_frames([sequence], SETTINGS), seed=0)
     state = TrainingState(state.avatar, state.adam, state.density, state.track, {})
     assert state.density is not None
     state.density.load_state(empty_statistics(count))
     paint_targets(sequence, state.avatar, like)
-    return state, TrainingData(order, (Targets(sequence, 0, like=like),))
+    return state, case_data(sequence, like=like)
+
+
+def case_data(sequence: Sequence, settings: TrainSettings = SETTINGS, like: Tensor = _ON_CPU) -> TrainingData:
+    """Return the pictures of a case in a training's order."""
+    order = FrameOrder(training_frames([sequence], settings), seed=0)
+    return TrainingData(order, (Targets(sequence, 0, like=like, cleaned=settings.edges == "cleaned"),))
 
 
 def empty_statistics(count: int) -> dict[str, Tensor]:
@@ -158,7 +172,7 @@ def benchmark_sequence(face_model: FaceModel, width: int, height: int) -> Sequen
     return Sequence("benchmark", capture, tracking, np.zeros(pictures.shape[:-1], np.uint8))
 
 
-def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor) -> None:
+def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor = _ON_CPU) -> None:
     """Paint pictures of the same head in noisy colours, so that every loss has a gradient."""
     noise = np.random.default_rng(0)
     for timestep in range(TIMESTEPS):

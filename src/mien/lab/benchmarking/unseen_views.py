@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.disk.files import write_atomically
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.scoring import Scores, ScoreSettings, as_8_bit, mean_scores, perceptual_metric, score_pictures
@@ -23,6 +21,7 @@ from mien.lab.synthetic.truth import Truth
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
 from mien.media.pictures import Box
+from mien.pages.plots import Axes, Series, write_chart
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
 from mien.tracking.neck_cut import NeckParts
@@ -34,10 +33,6 @@ from mien.training.footage.sequence import composite
 from mien.training.whole_head.completion import complete_colors, vertex_means
 
 AVATAR, MESH = "avatar", "mesh"
-_TILE = 160
-"""Side of a picture on the sheet, in pixels."""
-_DEPTH_OF_MIDDLE = 0.08
-"""Distance of the head's middle behind that of the face, in metres."""
 Figures = dict[str, dict[str, Any]]
 """Mean figures (`mean_scores`) by angle and by what is scored."""
 
@@ -53,21 +48,8 @@ class SidePictures:
     """The timestep of the sequence that each picture shows."""
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One picture to score."""
-
-    camera: int
-    moment: int
-
-    @cached_property
-    def label(self) -> str:
-        """The row that the view counts in: left and right count together."""
-        return angle_names()[self.camera]
-
-
-_Job = tuple[_View, dict[str, Tensor], Tensor, Box]
-"""A view, its pictures to score, the truth, and the head crop."""
+_Job = tuple[dict[str, Tensor], Tensor, Box]
+"""Pictures to score, the truth, and the head crop."""
 
 
 def angle_names() -> list[str]:
@@ -106,12 +88,11 @@ class Front:
         return own / true
 
     def behind(self, ahead: Float[np.ndarray, " 3"]) -> "Front":
-        """Return this front camera with both middles moved from that of the face to that of the head.
+        """Return this front camera with both middles moved from that of the face to that of the head, 8 cm behind.
 
-        Args:
-            ahead: Direction in which the true head looks, in the true world.
+        The true head looks `ahead` in the true world.
         """
-        back = -_DEPTH_OF_MIDDLE * ahead
+        back = -0.08 * ahead
         return replace(
             self,
             true_middle=self.true_middle + back,
@@ -130,10 +111,6 @@ def camera_beside(camera: Camera, front: Front) -> Camera:
 
     A similarity that aligns the tracked vertices with the true ones would do for a perfect shape. But vertices that are
     off by a millimetre along the skin make it half a percent too large or small, and shift it by a quarter of a pixel.
-
-    Args:
-        camera: The camera in the true world.
-        front: The front camera.
     """
     side, true = (one.viewmat.double().numpy() for one in (camera, front.true))
     lens, true_lens, tracked_lens = (one.K.double().numpy() for one in (camera, front.true, front.tracked))
@@ -164,61 +141,74 @@ def score_side_views(
 ) -> tuple[Figures, Float[np.ndarray, "h w 3"]]:
     """Figures by angle for the avatar and the mesh in completed colours, and a sheet: truth, avatar, mesh by angle.
 
-    The pictures are cut and cropped as in every other protocol: over white, above the cut at the neck of the posed
-    head.
-    An avatar is posed as in `experiment`, and seen by the true cameras as they stand beside the front camera
-    (`camera_beside`).
-
-    Args:
-        experiment: The trained avatar with its sequences.
-        sequence: Name of the sequence that the pictures show.
-        pictures: The true pictures.
-        settings: Which figures. ST-LPIPS is computed for one of `settings.perceptual_frames` moments per camera.
+    The pictures show a sequence of the experiment. They are cut and cropped as in every other protocol: over white,
+    above the cut at the neck of the posed head. An avatar is posed as in `experiment`, and seen by the true cameras as
+    they stand beside the front camera (`camera_beside`). ST-LPIPS is computed for one of `settings.perceptual_frames`
+    moments per camera.
     """
+    moments, threads = len(pictures.timesteps), settings.threads or None
     index = [one.name for one in experiment.sequences].index(sequence)
-    model, truth = experiment.avatar.face_model, pictures.truth
-    neck = NeckParts.of(model)
-    colors = _completed_colors(experiment, settings.threads or None)
-    metric, judged = perceptual_metric(settings), _judged(len(pictures.timesteps), settings.perceptual_frames)
-    tracking, used = experiment.sequences[index].tracking, experiment.faces[index]
-    true_points, cameras = truth.vertices_world.astype(np.float64), truth.tracking.cameras
+    colors, neck = _completed_colors(experiment, threads), NeckParts.of(experiment.avatar.face_model)
+    metric = perceptual_metric(settings)
+    # The moments for which ST-LPIPS is computed: evenly spread; all with 0.
+    judged = range(0, moments, max(1, -(-moments // settings.perceptual_frames)) if settings.perceptual_frames else 1)
+    shown: list[np.ndarray] = []
 
-    def drawn(view: _View) -> _Job:
-        timestep = pictures.timesteps[view.moment]
-        points = model(tracking.face[timestep])[0].numpy()[truth.vertex_index].astype(np.float64)
-        face = Front(cameras[0], tracking.cameras[0], true_points[view.moment].mean(0), points.mean(0))
-        ahead = truth.tracking.face[view.moment].T_world_head[0, :3, 2].double().numpy()
-        camera = camera_beside(cameras[view.camera], face.behind(ahead))
-        gaussians = experiment.avatar.pose(used[timestep]).gaussians.timestep(0)
-        place = (view.moment, view.camera)
-        matte, white = np.asarray(pictures.capture.mattes[place]), np.full(3, 255, np.uint8)
-        mask = head_cutter(model, neck, used[timestep])(matte, camera)
-        picture = composite(foreground_colors(np.asarray(pictures.capture.images[place]), matte), mask, white)
-        vertices = model(used[timestep])[0]
-        images = {
-            AVATAR: rasterize(gaussians, camera, torch.ones(3)).image.clamp(0, 1),
-            MESH: render_mesh(vertices, model.faces, camera, colors, supersample=2)[0].clamp(0, 1),
-        }
-        left, top, width, height = (int(value) for value in head_crop(mask))
-        return view, images, torch.from_numpy(picture).float() / 255, (left, top, width, height)
+    def jobs() -> Iterator[tuple[int, int, _Job]]:
+        views = [(camera, moment) for camera in range(len(SIDES) + 1) for moment in range(moments)]
+        for camera, moment in track_progress(views, "unseen views", len(views)):
+            job = _job(experiment, index, pictures, (colors, neck), camera, moment)
+            if moment == moments // 2:
+                tiles = [in_white_square(crop_to(image, job[2]), 160) for image in (job[1], *job[0].values())]
+                shown.append(np.concatenate(tiles, 0))
+            yield camera, moment, job
 
-    def score(job: _Job) -> tuple[_View, dict[str, Scores]]:
-        view, images, target, crop = job
+    def score(job: tuple[int, int, _Job]) -> tuple[str, dict[str, Scores]]:
+        camera, moment, (images, target, crop) = job
         eight = {name: as_8_bit(image) for name, image in images.items()}
-        return view, score_pictures(eight, target, crop, metric if view.moment in judged else None)
+        return angle_names()[camera], score_pictures(eight, target, crop, metric if moment in judged else None)
 
-    views = [_View(camera, moment) for camera in range(len(SIDES) + 1) for moment in range(len(pictures.timesteps))]
-    shown: list[list[np.ndarray]] = []
+    rows: dict[str, list[dict[str, Scores]]] = {}
+    for angle, scores in stream_in_threads(score, jobs(), threads):
+        rows.setdefault(angle, []).append(scores)
+    figures = {
+        angle: {name: mean_scores([row[name] for row in own]) for name in (AVATAR, MESH)} for angle, own in rows.items()
+    }
+    return figures, np.concatenate(shown, 1)
 
-    def jobs() -> Iterator[_Job]:
-        for view in track_progress(views, "unseen views", len(views)):
-            job = drawn(view)
-            if view.moment == len(pictures.timesteps) // 2:
-                shown.append([in_white_square(crop_to(image, job[3]), _TILE) for image in (job[2], *job[1].values())])
-            yield job
 
-    rows = list(stream_in_threads(score, jobs(), settings.threads or None))
-    return _by_angle(rows), np.concatenate([np.concatenate(row, 0) for row in shown], 1)
+def _job(
+    experiment: Experiment,
+    index: int,
+    pictures: SidePictures,
+    shared: tuple[Float[Tensor, "v 3"], NeckParts],
+    camera: int,
+    moment: int,
+) -> _Job:
+    """Draw the avatar and the mesh of a sequence as a camera sees them at a moment, beside the true picture.
+
+    All jobs share the completed colours of the mesh and the parts of its neck.
+    """
+    colors, neck = shared
+    model, truth, timestep = experiment.avatar.face_model, pictures.truth, pictures.timesteps[moment]
+    tracking, used = experiment.sequences[index].tracking, experiment.faces[index][timestep]
+    points = model(tracking.face[timestep])[0].numpy()[truth.vertex_index].astype(np.float64)
+    cameras = truth.tracking.cameras
+    true_points = truth.vertices_world[moment].astype(np.float64)
+    face = Front(cameras[0], tracking.cameras[0], true_points.mean(0), points.mean(0))
+    ahead = truth.tracking.face[moment].T_world_head[0, :3, 2].double().numpy()
+    view = camera_beside(cameras[camera], face.behind(ahead))
+    matte, white = np.asarray(pictures.capture.mattes[moment, camera]), np.full(3, 255, np.uint8)
+    mask = head_cutter(model, neck, used)(matte, view)
+    colors_of_person = foreground_colors(np.asarray(pictures.capture.images[moment, camera]), matte)
+    target = torch.from_numpy(composite(colors_of_person, mask, white)).float() / 255
+    gaussians = experiment.avatar.pose(used).gaussians.timestep(0)
+    images = {
+        AVATAR: rasterize(gaussians, view, torch.ones(3)).image.clamp(0, 1),
+        MESH: render_mesh(model(used)[0], model.faces, view, colors, supersample=2)[0].clamp(0, 1),
+    }
+    left, top, width, height = (int(value) for value in head_crop(mask))
+    return images, target, (left, top, width, height)
 
 
 def _completed_colors(experiment: Experiment, threads: int | None) -> Float[Tensor, "v 3"]:
@@ -231,36 +221,20 @@ def _completed_colors(experiment: Experiment, threads: int | None) -> Float[Tens
     return vertex_means(model, complete_colors(model, neutral, found.seen, found.colors))
 
 
-def _by_angle(rows: list[tuple[_View, dict[str, Scores]]]) -> Figures:
-    figures: Figures = {}
-    for label in dict.fromkeys(angle_names()):
-        own = [scored for view, scored in rows if view.label == label]
-        figures[label] = {name: mean_scores([row[name] for row in own]) for name in (AVATAR, MESH)}
-    return figures
-
-
 def write_unseen_chart(path: Path, figures: Figures) -> None:
-    """Write a chart of the head crop's PSNR over the angle aside. The file's ending decides its format."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
-    axes = figure.subplots()
-    for subject, style in ((AVATAR, "o-"), (MESH, "s--")):
-        level = {0.0 if label == "front" else float(label): row for label, row in figures.items() if _is_level(label)}
-        axes.plot(list(level), [row[subject]["head"]["psnr"] for row in level.values()], style, label=subject)
-    axes.set(xlabel="degrees from the front camera", ylabel="PSNR of the head crop, dB", title="unseen views")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    write_atomically(path, lambda part: figure.savefig(part, format=path.suffix.lstrip("."), dpi=130))
-
-
-def _is_level(label: str) -> bool:
-    return label == "front" or label.isdigit()
-
-
-def _judged(moments: int, count: int) -> set[int]:
-    """The moments for which ST-LPIPS is computed: `count` of them, evenly spread; all with 0."""
-    return set(range(0, moments, max(1, -(-moments // count)) if count else 1))
+    """Write a .svg of the head crop's PSNR over the angle to the side."""
+    level = {
+        0 if label == "front" else int(label): row
+        for label, row in figures.items()
+        if label.isdigit() or label == "front"
+    }
+    angles = np.array(list(level), np.float64)
+    series = [
+        Series(subject, angles, np.array([row[subject]["head"]["psnr"] for row in level.values()]), style)
+        for subject, style in ((AVATAR, "main"), (MESH, "second"))
+    ]
+    axes = Axes("degrees from the front camera", "dB")
+    write_chart(path, [("Unseen views: PSNR of the head crop, dB", series, axes)])
 
 
 def in_white_square(image: Float[Tensor, "h w 3"], side: int) -> UInt8[np.ndarray, "s s 3"]:

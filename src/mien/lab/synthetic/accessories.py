@@ -107,13 +107,9 @@ def build_shirt(
     shoulder_points: Float[np.ndarray, "p 3"],
     seed: int,
 ) -> RigidMesh:
-    """Build shoulders in a shirt with a round collar.
+    """Build shoulders in a shirt with a round collar, which covers the shoulders' points.
 
-    Args:
-        neck: Middle of the neck at the height of the collar.
-        neck_size: Half width and half depth of the neck there.
-        shoulder_points: Points of the skin beside the neck, which the shirt covers.
-        seed: Seed of the folds.
+    `neck` is the middle of the neck at the height of the collar, `neck_size` its half width and half depth there.
     """
     wide_neck, deep_neck = neck_size
     noise = SolidNoise(seed + 77)

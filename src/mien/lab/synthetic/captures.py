@@ -5,8 +5,9 @@ A folder is drawn frame by frame in bounded memory. If drawing is interrupted, i
 
 import hashlib
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,8 @@ from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.face.loading import face_model_edition
 from mien.lab.synthetic.recipe import SyntheticRecipe
-from mien.lab.synthetic.scene import SyntheticScene
-from mien.lab.synthetic.truth import hash_surface, truth_of, write_truth
+from mien.lab.synthetic.scene import SyntheticFrame, SyntheticScene
+from mien.lab.synthetic.truth import Truth, truth_of, write_truth
 from mien.machine.progress import progress_bar, say, track_progress
 from mien.media.video import write_video
 from mien.tracking.tracking import Tracking
@@ -32,8 +33,6 @@ _JSON, _WORK, _STATE = "synthetic.json", ".drawing", "state.json"
 VIDEO_NAME, CAPTURE_NAME, TRUTH_NAME = "video.mp4", "capture", "truth"
 DRAWING = 3
 """Drawing version, raised whenever a recipe would be drawn differently. Every key depends on it."""
-_CHUNK = 16
-"""Timesteps after which progress is saved."""
 
 
 def synthesize(recipe: SyntheticRecipe, seed: int) -> tuple[Capture, Tracking]:
@@ -82,7 +81,7 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
     FOLDER/truth is for `read_truth`. A complete folder is left as it is; an interrupted one is continued.
     """
     inputs = inputs_hash(scene)
-    if not _is_current(folder, inputs):
+    if not _is_current(folder / _JSON, inputs):
         try:
             content_hash = _draw_all(scene, folder, inputs)
         except OSError as error:
@@ -92,9 +91,7 @@ def write_scene(scene: SyntheticScene, folder: Path) -> str:
 
 
 def scene_key(scene: SyntheticScene) -> str:
-    """Return the key that is quoted with figures on a capture.
-
-    It is 16 hex digits over recipe, seeds, face model and drawing version.
+    """Return the key that is quoted with figures on a capture: 16 hex digits of recipe, seeds, face model, `DRAWING`.
 
     It is known before anything is drawn, and is the same on every machine, since it depends on no computed numbers.
     `tests/reference_signatures.py` checks whether two machines draw the same under one key.
@@ -116,36 +113,36 @@ def scene_key(scene: SyntheticScene) -> str:
 
 
 def inputs_hash(scene: SyntheticScene) -> str:
-    """Return a hash of all that decides the bytes on this machine, with the face model's numbers.
-
-    It shows whether a folder is up to date.
-    """
+    """Return a hash of all that decides the bytes on this machine, which shows whether a folder is up to date."""
     content = {"drawing": DRAWING, "name": scene.recipe.name, "source": scene.source}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _is_current(folder: Path, inputs: str) -> bool:
+def _is_current(record: Path, inputs: str) -> bool:
     try:
-        return read_json(folder / _JSON, FORMAT, VERSION).get("inputs") == inputs
+        return read_json(record, FORMAT, VERSION).get("inputs") == inputs
     except UserError:
         return False
 
 
 def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     (folder / _JSON).unlink(missing_ok=True)
-    store = Pictures(folder / _WORK, scene.recipe, scene.timesteps)
-    store.resume(inputs)
-    _draw_missing(scene, store, inputs)
+    recipe, total = scene.recipe, scene.timesteps
+    store = Pictures(folder / _WORK, scene)
+    done = store.resume(inputs)
+    with progress_bar(f"Drawing {recipe.name}", total, done) as advance:
+        for timestep, frames in enumerate(scene.all_frames(range(done, total)), done):
+            store.write(timestep, frames)
+            advance()
     images, mattes = store.maps()
-    content_hash = _hash_content(scene, images, mattes)
-    recipe = scene.recipe
+    truth = truth_of(scene)
+    content_hash = _hash_content(scene, images, mattes, truth)
     if recipe.cameras == "front":
         write_video(folder / VIDEO_NAME, (frame[0] for frame in images), recipe.fps, recipe.detail.compression)
     else:
         landmarks = np.stack(list(_detect_landmarks(scene, images)), axis=1)
         source = {**scene.source, "key": scene_key(scene), "drawn_hash": content_hash}
         write_capture(folder / CAPTURE_NAME, _make_capture(scene, images, mattes, landmarks, source, scene.cameras))
-    truth = truth_of(scene)
     write_truth(folder / TRUTH_NAME, truth)
     content = {
         "key": scene_key(scene),
@@ -162,78 +159,48 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
     return content_hash
 
 
-def _hash_content(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray) -> str:
-    """A hash over the bytes of all pictures and mattes, and of the truth.
-
-    It is the same for the same key on the same machine. Another processor may draw a pixel one grey level differently.
-    """
+def _hash_content(scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, truth: Truth) -> str:
+    """A hash of all pictures, mattes and the truth. Another processor may draw a pixel one grey level differently."""
     digest = hashlib.sha256(repr((scene.timesteps, scene.recipe.camera_ids)).encode())
     for timestep in range(scene.timesteps):
         digest.update(images[timestep].tobytes())
         digest.update(mattes[timestep].tobytes())
-    hash_surface(digest, scene)
+    for array in truth.stored.values():
+        digest.update(array.tobytes())
     return digest.hexdigest()[:16]
 
 
-@dataclass(frozen=True)
 class Pictures:
-    """Raw frames and mattes of an unfinished drawing."""
+    """Raw frames and mattes of an unfinished drawing: two files that grow by whole timesteps."""
 
-    folder: Path
-    recipe: SyntheticRecipe
-    timesteps: int
+    def __init__(self, folder: Path, scene: SyntheticScene) -> None:
+        self._folder, recipe = folder, scene.recipe
+        self._shape = (scene.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
 
-    @property
-    def _shape(self) -> tuple[int, int, int, int]:
-        recipe = self.recipe
-        return (self.timesteps, len(recipe.camera_ids), recipe.height, recipe.width)
-
-    def resume(self, inputs: str) -> None:
-        """Continue a drawing of the same inputs, else start again."""
-        try:
-            kept = read_json(self.folder / _STATE, FORMAT, VERSION).get("inputs") == inputs
-        except UserError:
-            kept = False
-        if not kept:
-            remove_tree(self.folder)
-            self.folder.mkdir(parents=True)
+    def resume(self, inputs: str) -> int:
+        """Continue a drawing of the same inputs, or else start again. Returns the number of complete timesteps."""
+        if not _is_current(self._folder / _STATE, inputs):
+            remove_tree(self._folder)
+            self._folder.mkdir(parents=True)
             for name in ("frames.u8", "mattes.u8"):
-                (self.folder / name).touch()
-            self.mark(inputs, 0)
+                (self._folder / name).touch()
+            write_json(self._folder / _STATE, FORMAT, VERSION, {"inputs": inputs})
+        size = math.prod(self._shape[1:])
+        sizes = {"frames.u8": 3 * size, "mattes.u8": size}
+        return min((self._folder / name).stat().st_size // size for name, size in sizes.items())
 
-    def mark(self, inputs: str, done: int) -> None:
-        """Record how many timesteps are complete."""
-        write_json(self.folder / _STATE, FORMAT, VERSION, {"inputs": inputs, "done": done})
-
-    def done(self) -> int:
-        """Return the number of complete timesteps."""
-        return int(read_json(self.folder / _STATE, FORMAT, VERSION)["done"])
-
-    def append(self, timestep: int, images: np.ndarray, mattes: np.ndarray) -> None:
-        """Write one timestep at its position.
-
-        It uses plain writes, so that a full disk raises an error instead of crashing.
-        """
-        for name, array in (("frames.u8", images), ("mattes.u8", mattes)):
-            with (self.folder / name).open("r+b") as file:
-                file.seek(timestep * array.nbytes)
-                file.write(array.tobytes())
+    def write(self, timestep: int, frames: Sequence[SyntheticFrame]) -> None:
+        """Write one timestep at its position, by plain writes, since a full disk would make a memory map crash."""
+        for name, parts in (("frames.u8", [f.image for f in frames]), ("mattes.u8", [f.matte for f in frames])):
+            data = b"".join(part.tobytes() for part in parts)
+            with (self._folder / name).open("r+b") as file:
+                file.seek(timestep * len(data))
+                file.write(data)
 
     def maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Return all frames [t, c, h, w, 3] and mattes [t, c, h, w] as memory maps."""
-        images = np.memmap(self.folder / "frames.u8", np.uint8, "r", shape=(*self._shape, 3))
-        return images, np.memmap(self.folder / "mattes.u8", np.uint8, "r", shape=self._shape)
-
-
-def _draw_missing(scene: SyntheticScene, store: Pictures, inputs: str) -> None:
-    total, done = scene.timesteps, store.done()
-    with progress_bar(f"Drawing {scene.recipe.name}", total, done) as advance:
-        drawn = scene.all_frames(range(done, total)) if done < total else iter(())
-        for timestep, frames in enumerate(drawn, done):
-            store.append(timestep, np.stack([f.image for f in frames]), np.stack([f.matte for f in frames]))
-            if (timestep + 1) % _CHUNK == 0 or timestep + 1 == total:
-                store.mark(inputs, timestep + 1)
-            advance()
+        images = np.memmap(self._folder / "frames.u8", np.uint8, "r", shape=(*self._shape, 3))
+        return images, np.memmap(self._folder / "mattes.u8", np.uint8, "r", shape=self._shape)
 
 
 def _make_capture(

@@ -1,10 +1,8 @@
-"""Measure where a landmark detector finds a face model's points on people.
+"""Measure where a detector finds a face model's points: `python -m mien.lab.synthetic.detector_calibration anny`.
 
-Run as `python -m mien.lab.synthetic.detector_calibration anny`.
-
-It draws synthetic people with skin, hair, glasses and beards through many kinds of lenses, runs the detector on them,
-and fits the model of `mien.tracking.landmarks.DetectorResponse`. The result ships with mien (src/mien/tracking/data).
-Run this only after a change of a face model, its landmarks or the painter: 200 people take half an hour.
+It draws people through many kinds of lenses, runs the detector on them, and fits a `DetectorResponse`. The result ships
+with mien (src/mien/tracking/data). Run this only after a change of a face model, its landmarks or the painter: 200
+people take half an hour.
 
 `--detector litert --people 20` measures how the other detector differs on the same pictures, and adds that to the
 response of mediapipe. Fewer people suffice for it, because both see the same faces.
@@ -30,26 +28,11 @@ from mien.machine.progress import say, track_progress
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.landmarks.detector_response import DetectorResponse, read_response, response_path, write_response
 
-_FIRST_SEED = 500
-"""First seed, far from those of the reference captures, so that nobody is both calibrated on and measured on."""
-_SHOWINGS = 2
-"""Times that each picture is shown to the detector, which follows a face from picture to picture."""
-_FOCALS = (1.2, 1.7, 2.4, 3.2)
-"""Focal lengths in picture widths."""
 _MAX_OFFSET = 0.008
 """Median offset in metres above which the detector has found something else."""
-_MIN_PICTURES = 5
-"""Fewest pictures of a person."""
-_DEPTH_RIDGE = 0.05
-"""Regularisation of a person's offsets towards zero, in pictures. Only turned heads show depth."""
-_HABIT_RIDGE = 2.0
-"""Regularisation of the response to turns and expressions towards zero, in pictures."""
-_ROUNDS = 6
-"""Rounds that alternate between habits and people."""
 _NOISE = 1e-3
 """Noise of a landmark that a tracker expects, in metres."""
-_COMPONENTS = 40
-_FOLDS = 5
+_COMPONENTS, _FOLDS = 40, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +58,7 @@ def _sight(scene: SyntheticScene, images: Sequence[np.ndarray], face_model: Face
     found = []
     with LandmarkDetector(several_faces=False, detector=detector) as finder:
         for timestep, image in enumerate(images):
-            faces = [finder.detect(image) for _ in range(_SHOWINGS)][-1]
+            faces = [finder.detect(image) for _ in range(2)][-1]  # It follows a face from picture to picture.
             if len(faces):
                 found.append((timestep, torch.from_numpy(np.asarray(faces[0])).float()))
     if not found:
@@ -94,14 +77,14 @@ def _sight(scene: SyntheticScene, images: Sequence[np.ndarray], face_model: Face
 
 def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> DetectorResponse:
     """Fit the linear model that explains the detections of these people by least squares."""
-    people = [person for person in people if len(person.R_seen) >= _MIN_PICTURES]
+    people = [person for person in people if len(person.R_seen) >= 5]
     if len(people) < 2 * _FOLDS:
         raise UserError(
             f"the detector found {len(people)} people, but {2 * _FOLDS} are needed: draw more, and check the pictures"
         )
     offsets = [_offsets(person, person.across) for person in people]
     habits = torch.zeros(0)
-    for _ in range(_ROUNDS):
+    for _ in range(6):
         habits = _fit_habits(people, offsets)
         offsets = [_offsets(person, person.across - _explained(person, habits)) for person in people]
     found = torch.stack(offsets)
@@ -121,8 +104,7 @@ def differing_response(
 ) -> DetectorResponse:
     """Return the response of another detector, from a known one and from the sightings of both in the same pictures.
 
-    Means and the part by turns change. Expressions and people keep what was measured on more people: what few people
-    say about them did not help on others.
+    Only means and the part by turns change: what few people say about expressions and people did not help on others.
     """
     pairs = [
         (own, other)
@@ -143,7 +125,7 @@ def differing_response(
 
 def _recipe(seed: int, face_model: FaceModel) -> SyntheticRecipe:
     random = np.random.default_rng(seed)
-    focal = float(random.choice(_FOCALS))
+    focal = float(random.choice((1.2, 1.7, 2.4, 3.2)))  # in picture widths
     return SyntheticRecipe(
         width=384, height=384, fps=2.5, texture_size=512, face_model=face_model.name,
         glasses=bool(random.random() < 0.15), hair="long" if seed % 4 == 3 else "short",
@@ -154,15 +136,15 @@ def _recipe(seed: int, face_model: FaceModel) -> SyntheticRecipe:
 
 
 def _offsets(person: Sightings, across: Float[Tensor, "n l 2"]) -> Float[Tensor, "l 3"]:
-    """Fit offsets in the head frame to offsets across the line of sight."""
+    """Fit offsets in the head frame to offsets across the line of sight. Only turned heads show depth."""
     n = len(across)
-    hessian = torch.einsum("nxc,nxd->cd", person.R_seen, person.R_seen) / n + _DEPTH_RIDGE * torch.eye(3)
+    hessian = torch.einsum("nxc,nxd->cd", person.R_seen, person.R_seen) / n + 0.05 * torch.eye(3)
     return torch.linalg.solve(hessian, torch.einsum("nxc,nlx->cl", person.R_seen, across) / n).T
 
 
 def _fit_habits(people: Sequence[Sightings], offsets: Sequence[Float[Tensor, "l 3"]]) -> Float[Tensor, "h l 3"]:
     count, points = people[0].habits.shape[1], len(offsets[0])
-    hessian, right = _HABIT_RIDGE * torch.eye(3 * count), torch.zeros(3 * count, points)
+    hessian, right = 2.0 * torch.eye(3 * count), torch.zeros(3 * count, points)
     for person, own in zip(people, offsets, strict=True):
         seen = (person.habits[:, None, :, None] * person.R_seen[:, :, None, :]).flatten(2)
         left = person.across - torch.einsum("nxc,lc->nlx", person.R_seen, own)
@@ -201,7 +183,7 @@ def main(name: tyro.conf.Positional[str] = "anny", people: int = 200, detector: 
         detector: The detector. Any but mediapipe is measured against mediapipe, whose response must be there.
     """
     face_model = load_face_model(name)
-    seeds = range(_FIRST_SEED, _FIRST_SEED + people)
+    seeds = range(500, 500 + people)  # far from those of the reference captures: nobody is calibrated and measured on
     detectors = ("mediapipe",) if detector == "mediapipe" else ("mediapipe", detector)
     rounds = track_progress(seeds, "Drawing and detecting", people)
     seen = list(zip(*(sight_person(seed, face_model, detectors) for seed in rounds), strict=True))

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from mien.lab.synthetic import anatomy as places
 from mien.lab.synthetic.anatomy import Anatomy, face_view, resample
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep, unit
-from mien.lab.synthetic.hair import Strands
+from mien.lab.synthetic.hair import HeadPose, Strands
 from mien.machine import exact
 
 _BEARD_COUNT, _BEARD_STEPS = 5200, 7
@@ -19,17 +19,17 @@ _BEARD_COUNT, _BEARD_STEPS = 5200, 7
 class RootedStrands:
     """Strands that each keep their shape in the frame of the skin where they grow."""
 
-    faces: Int[np.ndarray, " n"]
-    """Index of each root's triangle in the face model."""
+    corners: Int[np.ndarray, "n 3"]
+    """Vertices of each root's triangle."""
     barycentric: Float[np.ndarray, "n 3"]
     local: Float[np.ndarray, "n s 3"]
     """Offsets from the root in the frame of `_frames`, in metres."""
     widths: Float[np.ndarray, "n s"]
     colors: Float[np.ndarray, "n s 3"]
 
-    def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
+    def posed(self, pose: HeadPose) -> Strands:
         """Return the strands on a posed head, in the head frame."""
-        roots, frames = _frames(anatomy, self.faces, self.barycentric, vertices, normals)
+        roots, frames = _frames(self.corners, self.barycentric, pose.head, pose.normals)
         points = roots[:, None] + exact.product(self.local, np.swapaxes(frames, 1, 2))
         outwards = np.repeat(frames[:, None, :, 2], points.shape[1], axis=1)
         return Strands(points.astype(np.float32), self.widths, self.colors, np.ascontiguousarray(outwards))
@@ -49,8 +49,8 @@ def beard_zone(anatomy: Anatomy, points: Float[np.ndarray, "n 3"]) -> Float[np.n
 def grow_beard(anatomy: Anatomy, color: Float[np.ndarray, " 3"], length: float, seed: int) -> RootedStrands:
     """Grow hairs that leave the skin at a slant, down and sideways, and curl; `length` at the chin is in metres."""
     random, noise = np.random.default_rng([seed, 10]), SolidNoise(seed + 53)
-    faces, barycentric, roots = _roots(anatomy, random)
-    _, frames = _frames(anatomy, faces, barycentric, anatomy.vertices, anatomy.normals)
+    triangles, barycentric, roots = _roots(anatomy, random)
+    _, frames = _frames(triangles, barycentric, anatomy.vertices, anatomy.normals)
     normals, marks = frames[:, :, 2], anatomy.landmarks
     mouth, chin = marks[places.MOUTH_TOP, 1], marks[places.CHIN, 1]
     moustache = smoothstep(mouth - 0.004, mouth + 0.002, roots[:, 1]) * (np.abs(roots[:, 0]) < 0.034)
@@ -73,7 +73,7 @@ def grow_beard(anatomy: Anatomy, color: Float[np.ndarray, " 3"], length: float, 
     shade = (0.45 + 0.55 * np.linspace(0, 1, _BEARD_STEPS)) * tint
     colors = np.where(gray[..., None], 0.25, color) * shade[..., None]
     return RootedStrands(
-        faces=faces,
+        corners=triangles,
         barycentric=barycentric,
         local=exact.product(offsets, frames).astype(np.float32),
         widths=(0.00062 * np.linspace(1, 0.45, _BEARD_STEPS) * random.uniform(0.8, 1.2, (_BEARD_COUNT, 1))).astype(
@@ -102,16 +102,15 @@ def _roots(anatomy: Anatomy, random: np.random.Generator) -> tuple[np.ndarray, n
         grows = (above_neck * beard_zone(anatomy, points) > random.uniform(0.05, 1.0, _BEARD_COUNT)) & ~on_lips
         kept.append((candidates[chosen[grows]], barycentric[grows], points[grows]))
     faces, barycentric, points = (np.concatenate(parts)[:_BEARD_COUNT] for parts in zip(*kept, strict=True))
-    return faces, barycentric, points
+    return anatomy.faces[faces], barycentric, points
 
 
 def _frames(
-    anatomy: Anatomy, faces: np.ndarray, barycentric: np.ndarray, vertices: np.ndarray, normals: np.ndarray
+    triangles: np.ndarray, barycentric: np.ndarray, vertices: np.ndarray, normals: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """Return roots, and frames with these columns: tangent along the triangle's first edge, second tangent, normal."""
-    index = anatomy.faces[faces]
-    corners = vertices[index]
-    normal = unit(exact.mixed(barycentric, normals[index]))
+    corners = vertices[triangles]
+    normal = unit(exact.mixed(barycentric, normals[triangles]))
     edge = corners[:, 1] - corners[:, 0]
     tangent = unit(edge - exact.dot(edge, normal)[:, None] * normal)
     frames = np.stack([tangent, np.cross(normal, tangent), normal], -1).astype(np.float32)
@@ -122,19 +121,18 @@ def _frames(
 class SkinStrands:
     """Brow hairs. Every point lies over a triangle of the skin and moves with it."""
 
-    faces: Int[np.ndarray, "n s"]
-    """Index of each point's triangle in the face model."""
+    corners: Int[np.ndarray, "n s 3"]
+    """Vertices of each point's triangle."""
     barycentric: Float[np.ndarray, "n s 3"]
     heights: Float[np.ndarray, "n s"]
     """Heights above the skin, in metres."""
     widths: Float[np.ndarray, "n s"]
     colors: Float[np.ndarray, "n s 3"]
 
-    def posed(self, anatomy: Anatomy, vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Strands:
+    def posed(self, pose: HeadPose) -> Strands:
         """Return the strands on a posed head, in the head frame."""
-        corners = anatomy.faces[self.faces]
-        outwards = unit(exact.mixed(self.barycentric, normals[corners]))
-        points = exact.mixed(self.barycentric, vertices[corners]) + self.heights[..., None] * outwards
+        outwards = unit(exact.mixed(self.barycentric, pose.normals[self.corners]))
+        points = exact.mixed(self.barycentric, pose.head[self.corners]) + self.heights[..., None] * outwards
         return Strands(points, self.widths, self.colors, outwards)
 
 
@@ -163,7 +161,7 @@ def grow_brows(
     heights = np.linspace(0.0001, 0.0012, steps) * random.uniform(0.5, 1.2, (count, 1))
     tint = np.exp(0.2 * random.normal(size=(count, 1, 1)))
     return SkinStrands(
-        faces=faces.reshape(count, steps),
+        corners=anatomy.faces[faces].reshape(count, steps, 3),
         barycentric=barycentric.reshape(count, steps, 3),
         heights=heights.astype(np.float32),
         widths=(0.00055 * np.linspace(1, 0.4, steps) * np.ones((count, 1))).astype(np.float32),
@@ -216,37 +214,38 @@ def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.stack([1 - v - w, v, w], -1)
 
 
-def grow_lashes(
-    landmarks: Float[np.ndarray, "l 3"],
-    eye_centers: Float[np.ndarray, "2 3"],
-    eye_radius: float,
-    steps: int = 4,
-) -> Strands:
-    """Grow lashes along the posed rims of the lids, outwards from the eyeball. Upper ones curl up."""
-    points, outwards, widths = [], [], []
-    on_lid = eye_radius + 0.0012
-    for side, center in zip(places.SIDES, eye_centers, strict=True):
-        for rims, longest, curl, count in (
-            (places.UPPER_LIDS, 0.0058, 0.62, 44),
-            (places.LOWER_LIDS, 0.0030, -0.5, 24),
-        ):
-            roots = resample(landmarks[list(rims[side])], count + 6)[3:-3]
-            radial = unit(roots - center)
-            # If landmarks lie on the inner fold of a lid, lashes still start on its outside.
-            roots = center + np.maximum(exact.length(roots - center)[:, None], on_lid) * radial
-            aside = np.linspace(0.6, -0.25, count)[:, None] * np.array([1.0 if side == "left" else -1.0, 0, 0])
-            vary = 1 + 0.25 * np.sin(np.arange(count) * 12.9898) * np.cos(np.arange(count) * 4.1)
-            upward = np.array([0.0, 1.0, 0.0]) - radial[:, 1:2] * radial
-            t = np.linspace(0, 1, steps)[None, :, None]
-            reach = (longest * vary * (0.65 + 0.35 * np.sin(np.linspace(0.2, 2.6, count))))[:, None, None]
-            bend = t * (radial + 0.5 * aside)[:, None] + curl * t * t * upward[:, None]
-            points.append(roots[:, None] + reach * bend)
-            outwards.append(np.repeat(radial[:, None], steps, 1))
-            widths.append(np.repeat((0.0003 if curl > 0 else 0.00016) * np.linspace(1, 0.4, steps)[None], count, 0))
-    total = sum(len(part) for part in points)
-    return Strands(
-        np.concatenate(points).astype(np.float32),
-        np.concatenate(widths).astype(np.float32),
-        np.full((total, steps, 3), 0.012, np.float32),
-        np.concatenate(outwards).astype(np.float32),
-    )
+@dataclass(frozen=True)
+class Lashes:
+    """Lashes along the posed rims of the lids, outwards from the eyeball. Upper ones curl up."""
+
+    eye_radius: float
+    """Radius of an eyeball in metres."""
+
+    def posed(self, pose: HeadPose) -> Strands:
+        """Return the strands on a posed head, in the head frame."""
+        points, outwards, widths, steps = [], [], [], 4
+        on_lid = self.eye_radius + 0.0012
+        for side, center in zip(places.SIDES, pose.eye_centers, strict=True):
+            for rims, longest, curl, count in (
+                (places.UPPER_LIDS, 0.0058, 0.62, 44),
+                (places.LOWER_LIDS, 0.0030, -0.5, 24),
+            ):
+                roots = resample(pose.landmarks[list(rims[side])], count + 6)[3:-3]
+                radial = unit(roots - center)
+                # If landmarks lie on the inner fold of a lid, lashes still start on its outside.
+                roots = center + np.maximum(exact.length(roots - center)[:, None], on_lid) * radial
+                aside = np.linspace(0.6, -0.25, count)[:, None] * np.array([1.0 if side == "left" else -1.0, 0, 0])
+                vary = 1 + 0.25 * np.sin(np.arange(count) * 12.9898) * np.cos(np.arange(count) * 4.1)
+                upward = np.array([0.0, 1.0, 0.0]) - radial[:, 1:2] * radial
+                t = np.linspace(0, 1, steps)[None, :, None]
+                reach = (longest * vary * (0.65 + 0.35 * np.sin(np.linspace(0.2, 2.6, count))))[:, None, None]
+                bend = t * (radial + 0.5 * aside)[:, None] + curl * t * t * upward[:, None]
+                points.append(roots[:, None] + reach * bend)
+                outwards.append(np.repeat(radial[:, None], steps, 1))
+                widths.append(np.repeat((0.0003 if curl > 0 else 0.00016) * np.linspace(1, 0.4, steps)[None], count, 0))
+        return Strands(
+            np.concatenate(points).astype(np.float32),
+            np.concatenate(widths).astype(np.float32),
+            np.full((sum(map(len, points)), steps, 3), 0.012, np.float32),
+            np.concatenate(outwards).astype(np.float32),
+        )

@@ -11,9 +11,20 @@ from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep, unit
 from mien.machine import exact
 from mien.machine.exact import dot, length, mixed
 
-_LONG_STEPS = 22
-_LONG_COUNT = 7500
+_LONG_STEPS, _LONG_COUNT = 22, 7500
 """Points per strand, and strands, of long hair."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeadPose:
+    """What hair follows at one timestep, in the head frame."""
+
+    head: Float[np.ndarray, "v 3"]
+    """The face model's vertices."""
+    normals: Float[np.ndarray, "v 3"]
+    landmarks: Float[np.ndarray, "l 3"]
+    eye_centers: Float[np.ndarray, "2 3"]
+    T_head_shoulders: Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +39,10 @@ class Strands:
     """Linear albedo, darker where hair shades itself."""
     outwards: Float[np.ndarray, "n s 3"]
     """Unit directions away from the surface under the hair."""
+
+    def posed(self, _: HeadPose) -> "Strands":
+        """Return the strands themselves."""
+        return self
 
     @cached_property
     def tangents(self) -> Float[np.ndarray, "n s 3"]:
@@ -133,22 +148,18 @@ class DrapedStrands:
     follow: Float[np.ndarray, "n s"]
     """Share of the shoulders' motion that each point follows, 0..1."""
 
-    def posed(self, T_head_shoulders: Float[np.ndarray, "4 4"]) -> Strands:
+    def posed(self, pose: HeadPose) -> Strands:
         """Return the strands in the head frame when the shoulders are turned relative to the head."""
-        points = self.rest.points
-        on_shoulders = exact.rotated(points, T_head_shoulders[:3, :3], T_head_shoulders[:3, 3])
+        points, T = self.rest.points, pose.T_head_shoulders
+        on_shoulders = exact.rotated(points, T[:3, :3], T[:3, 3])
         moved = points + self.follow[..., None] * (on_shoulders - points)
         return Strands(moved.astype(np.float32), self.rest.widths, self.rest.colors, self.rest.outwards)
 
 
 def grow_long_hair(anatomy: Anatomy, color: Float[np.ndarray, " 3"], collar: float, seed: int) -> DrapedStrands:
-    """Grow shoulder-length strands that hang from a parting. They stay outside of skull, ears and face.
+    """Grow strands that hang from a parting to near the collar's height in the head frame, in metres.
 
-    Args:
-        anatomy: Anatomy of the head.
-        color: Linear albedo.
-        collar: Height of the collar in the head frame, in metres. The hair ends near it.
-        seed: Seed of this hair.
+    They stay outside of skull, ears and face.
     """
     random, noise = np.random.default_rng([seed, 3]), SolidNoise(seed + 31)
     roots = _scalp_points(anatomy, _LONG_COUNT, random)
@@ -215,7 +226,7 @@ class _Path:
         radius = exact.length(relative)
         outward = relative / radius[:, None]
         top = smoothstep(0.3, 0.85, outward[:, 1])
-        mirrored = points * np.array([1, 1, 1], np.float32)
+        mirrored = points.copy()
         mirrored[:, 0] = np.abs(mirrored[:, 0])
         at_ear = np.exp(-((mirrored - self._ear) ** 2).sum(-1) / (2 * 0.042**2))
         height = self._layer * (0.011 + 0.009 * top) * smoothstep(-0.02, 0.25, np.full(len(points), along))

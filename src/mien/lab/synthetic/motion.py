@@ -20,16 +20,8 @@ from mien.lab.synthetic.recipe import Segment, SegmentKind, SyntheticRecipe
 from mien.machine import exact
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
-_MAX_GAZE = 0.42
-"""Largest angle of the gaze in radians. Beyond it the head turns."""
-_SHOULDERS_FOLLOW = 0.25
-"""Share of the head's rotation that the shoulders follow."""
-_RAMP = 0.5
-"""Seconds in which a part fades in and out."""
 _TURNS = ((0.0, 1.0), (0.0, -1.0), (0.7, 0.0), (-0.8, 0.0), (0.4, 0.7), (-0.4, -0.7), (0.4, -0.7), (-0.4, 0.7))
 """Goals of successive turns, as shares of the largest pitch (positive looks down) and yaw."""
-_TURN_SECONDS = 2.2
-"""Seconds from one goal to the next."""
 
 _Tracks = dict[str, np.ndarray]
 """Coefficients over time by name. A name without a side means both sides."""
@@ -84,7 +76,7 @@ class _Span:
 
     def window(self, times: np.ndarray) -> np.ndarray:
         """Return 1 inside and 0 outside, with soft ends inside, except at the beginning and the end of the clip."""
-        ramp = min(_RAMP, 0.25 * (self.end - self.start))
+        ramp = min(0.5, 0.25 * (self.end - self.start))
         rise = 1.0 if self.first else smoothstep(self.start, self.start + ramp, times)
         fall = 0.0 if self.last else smoothstep(self.end - ramp, self.end, times)
         return rise - fall + np.zeros_like(times)
@@ -120,7 +112,7 @@ def _wide_turns(times: np.ndarray, spans: tuple[_Span, ...], pitch: float, yaw: 
         if span.kind != "turns":
             continue
         before = np.zeros(2)
-        moves = max(int((span.end - span.start) / _TURN_SECONDS), 2)
+        moves = max(int((span.end - span.start) / 2.2), 2)
         length = (span.end - span.start) / moves
         for index in range(moves):
             goal = np.array(_TURNS[index % len(_TURNS)] if index < moves - 1 else (0.0, 0.0))
@@ -135,15 +127,7 @@ def _wide_turns(times: np.ndarray, spans: tuple[_Span, ...], pitch: float, yaw: 
 def _make_tracks(
     random: np.random.Generator, times: np.ndarray, scale: float, spans: tuple[_Span, ...], *, blinks: bool
 ) -> _Tracks:
-    """Return every coefficient over time that is not always 0.
-
-    Args:
-        random: Decides timing and order.
-        times: Times in seconds.
-        scale: Scale of everything but blinks.
-        spans: Spans of the script.
-        blinks: Whether to add blinks.
-    """
+    """Return every coefficient over time that is not always 0; `scale` is that of everything but blinks."""
     tracks: _Tracks = {}
     for span in spans:
         for add in _EXPRESSIONS_OF[span.kind]:
@@ -241,7 +225,7 @@ def generate_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticR
     """Return face parameters of every timestep. The camera is at the world's origin and looks along -z.
 
     The head turns about the base of the neck, which sways. The neck joint, if the model has one, bends so that the base
-    of the neck stays with the shoulders. The shoulders follow the head's turns by a quarter.
+    of the neck stays with the shoulders.
     """
     random = np.random.default_rng([seed, 1])
     times, spans = np.arange(recipe.timesteps) / recipe.fps, _lay_out(recipe)
@@ -254,7 +238,7 @@ def generate_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticR
     turned = _wide_turns(times, spans, *np.radians(recipe.turns)[::-1])
     pitch_yaw_roll[:, :2] += np.stack(turned, axis=-1)
     gaze = _gaze(random, times, spans) if recipe.blinks else np.zeros((len(times), 2))
-    gaze -= np.clip(0.85 * pitch_yaw_roll[:, :2], -_MAX_GAZE, _MAX_GAZE)  # the eyes keep looking into the camera
+    gaze -= np.clip(0.85 * pitch_yaw_roll[:, :2], -0.42, 0.42)  # the eyes keep looking into the camera
     tracks = _make_tracks(random, times, recipe.expression, spans, blinks=recipe.blinks)
     rotations = _euler_matrices(pitch_yaw_roll)
     pivot = neck_pivot(model, identity)
@@ -270,8 +254,8 @@ def generate_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticR
 
 
 def shoulder_rotation(head_rotation: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Return the shoulders' rotations, given the head's as axis-angle."""
-    return matrix_from_axis_angle(_SHOULDERS_FOLLOW * head_rotation)
+    """Return the shoulders' rotations, which are a quarter of the head's (axis-angle)."""
+    return matrix_from_axis_angle(0.25 * head_rotation)
 
 
 def neck_pivot(model: FaceModel, identity: torch.Tensor) -> Float[np.ndarray, " 3"]:

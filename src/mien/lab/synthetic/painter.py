@@ -13,22 +13,9 @@ from mien.lab.synthetic.anatomy import LIPS_OUTER, SIDES, UPPER_LIDS
 from mien.lab.synthetic.arithmetic import SolidNoise, unit
 from mien.lab.synthetic.posing import project
 from mien.lab.synthetic.recipe import SyntheticRecipe
-from mien.lab.synthetic.subject import (
-    EYE,
-    FRAME,
-    HAIR,
-    MOUTH,
-    SHIRT,
-    SKIN,
-    TEETH,
-    PosedSubject,
-    Subject,
-    opaque_vertices,
-)  # fmt: skip
+from mien.lab.synthetic.subject import Material, PosedSubject, Subject, opaque_vertices
 from mien.machine import exact
 from mien.render.mesh import MeshFragments, interpolate, rasterize_mesh
-
-_BLOCK = 32768  # samples
 
 
 def draw(
@@ -41,8 +28,9 @@ def draw(
     fragments = rasterize_mesh(torch.from_numpy(vertices), torch.from_numpy(subject.faces), camera)
     canvas = _Canvas(subject, posed, camera, fragments, vertices)
     painters = {
-        SKIN: _paint_skin, EYE: _paint_eyes, TEETH: _paint_mouth, MOUTH: _paint_mouth, HAIR: _paint_hair,
-        SHIRT: _paint_shirt, FRAME: _paint_frame,
+        Material.SKIN: _paint_skin, Material.EYE: _paint_eyes, Material.TEETH: _paint_mouth,
+        Material.MOUTH: _paint_mouth, Material.HAIR: _paint_hair, Material.SHIRT: _paint_shirt,
+        Material.FRAME: _paint_frame,
     }  # fmt: skip
     for material, paint in painters.items():
         rows = np.flatnonzero(canvas.material == material)
@@ -62,12 +50,7 @@ class _Canvas:
     """The samples of a picture that hit something."""
 
     def __init__(
-        self,
-        subject: Subject,
-        posed: PosedSubject,
-        camera: Camera,
-        fragments: MeshFragments,
-        vertices: np.ndarray,
+        self, subject: Subject, posed: PosedSubject, camera: Camera, fragments: MeshFragments, vertices: np.ndarray
     ) -> None:
         self.subject, self.posed, self.camera, self.vertices = subject, posed, camera, vertices
         self.fragments = fragments
@@ -78,19 +61,11 @@ class _Canvas:
         self.colors = np.zeros((len(self.pixels), 3), np.float32)
         self.light = shading.turn_light(subject.lighting, posed.R_world_head)
 
-    def part(self, rows: Int[np.ndarray, " n"]) -> MeshFragments:
-        """Return some samples as a picture one pixel high."""
-        pixels = torch.from_numpy(self.pixels[rows])
-        return MeshFragments(
-            torch.from_numpy(self.face_index[rows])[None],
-            self.fragments.barycentric.reshape(-1, 3).index_select(0, pixels)[None],
-            self.fragments.depth.reshape(-1).index_select(0, pixels)[None],
-        )
-
     def interpolate(self, rows: Int[np.ndarray, " n"], attributes: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Interpolate attributes of vertices at some samples."""
         tensor = torch.from_numpy(np.ascontiguousarray(attributes, np.float32))
-        return interpolate(self.part(rows), tensor, torch.from_numpy(faces))[0].numpy()
+        part = _selected(self.fragments, torch.from_numpy(self.pixels[rows]))
+        return interpolate(part, tensor, torch.from_numpy(faces))[0].numpy()
 
     def views(self, pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Return unit directions from the surface towards the camera."""
@@ -100,6 +75,15 @@ class _Canvas:
         x = ((small - row * np.int32(self.camera.width)).astype(np.float32) + (0.5 - K[0, 2])) / -K[0, 0]
         y = (row.astype(np.float32) + (0.5 - K[1, 2])) / -K[1, 1]
         return unit(np.stack([x * R[0, i] + y * R[1, i] - R[2, i] for i in range(3)], -1))
+
+
+def _selected(fragments: MeshFragments, pixels: Int[torch.Tensor, " n"]) -> MeshFragments:
+    """Return some samples as a picture one pixel high."""
+    return MeshFragments(
+        fragments.face_index.reshape(-1).index_select(0, pixels)[None],
+        fragments.barycentric.reshape(-1, 3).index_select(0, pixels)[None],
+        fragments.depth.reshape(-1).index_select(0, pixels)[None],
+    )
 
 
 def _model_faces(canvas: _Canvas) -> np.ndarray:
@@ -124,7 +108,7 @@ def _paint_skin(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
 
 def _in_blocks(rows: np.ndarray, paint: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Paint in blocks so small that all intermediate arrays fit into a core's cache."""
-    return np.concatenate([paint(rows[start : start + _BLOCK]) for start in range(0, len(rows), _BLOCK)])
+    return np.concatenate([paint(rows[start : start + 32768]) for start in range(0, len(rows), 32768)])
 
 
 def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
@@ -161,7 +145,7 @@ def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     depth = exact.Parabola(lips[:, 0], lips[:, 2])(points[:, 0]).astype(np.float32) - points[:, 2]
     views = canvas.views(canvas.pixels[rows])
     normals = np.where(exact.dot(normals, views)[:, None] < 0, -normals, normals)
-    if canvas.material[rows[0]] == TEETH:
+    if canvas.material[rows[0]] == Material.TEETH:
         teeth = posed.head[np.unique(subject.anatomy.faces[subject.anatomy.region("teeth")]), 2]
         return shading.shade_teeth(rest, normals, teeth.max() - points[:, 2], views, canvas.light)
     return shading.shade_mouth(normals, depth, views, canvas.light)
@@ -227,12 +211,7 @@ def _add_lenses(canvas: _Canvas, image: Float[np.ndarray, "p 3"]) -> None:
     index = ((fragments.depth < behind) & (seen >= 0)).flatten().nonzero()[:, 0]
     if not len(index):
         return
-    part = MeshFragments(
-        fragments.face_index.reshape(-1).index_select(0, index)[None],
-        fragments.barycentric.reshape(-1, 3).index_select(0, index)[None],
-        fragments.depth.reshape(-1).index_select(0, index)[None],
-    )
-    normals = unit(interpolate(part, torch.from_numpy(lenses.normals), faces)[0].numpy())
+    normals = unit(interpolate(_selected(fragments, index), torch.from_numpy(lenses.normals), faces)[0].numpy())
     row, column = np.divmod(index.numpy(), right - left)
     pixels = (row + top) * camera.width + column + left
     image[pixels] = 0.93 * image[pixels] + shading.shade_lens(normals, canvas.views(pixels), canvas.light)
@@ -250,12 +229,9 @@ def develop(
     return _SRGB_TABLE[index]
 
 
-def _srgb(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-
-
 _TABLE_SIZE = 1 << 16
-_SRGB_TABLE = _srgb((np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE).astype(np.float32)
+_LINEAR = (np.arange(_TABLE_SIZE) + 0.5) / _TABLE_SIZE
+_SRGB_TABLE = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def paint_wall(recipe: SyntheticRecipe, seed: int) -> Float[np.ndarray, "h w 3"]:

@@ -22,7 +22,6 @@ class Segment:
     """still: nothing moves, not even an eye. speech: talking. expressions: posed expressions, each held. turns: wide
     turns of the head to all sides. free: talking, smiles and frowns in any order. All but `still` have blinks."""
     seconds: float
-    """Length in seconds."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +47,9 @@ class SyntheticRecipe:
     face_model: str = "anny"
     """Name of the face model, for `mien.face.load_face_model`."""
     width: int = 512
-    """Width of the frames in pixels."""
     height: int = 512
-    """Height of the frames in pixels."""
     seconds: float = 9.0
-    """Length of the clip in seconds."""
     fps: float = 25.0
-    """Frames per second."""
     focal: float = 2.35
     """Focal length in picture widths."""
     distance: float = 1.0
@@ -79,7 +74,6 @@ class SyntheticRecipe:
     """front: one camera in front of the face. ring: `ring_size` calibrated cameras on half a sphere, the first in
     front. sides: the front camera and those of `SIDES`, calibrated."""
     ring_size: int = 16
-    """Number of cameras in a ring."""
     script: tuple[Segment, ...] = ()
     """The script, part by part; it replaces `seconds`. If empty, there is one `free` part."""
     detail: Detail = field(default_factory=Detail)

@@ -53,13 +53,11 @@ class ReferenceCapture:
         scenes: list[SyntheticScene] = []
         for index, recipe in enumerate(self.sequences):
             scenes.append(SyntheticScene(recipe, self.seed, 1000 * self.seed + index, scenes[0] if scenes else None))
-        views = self.views
-        for recipe in self.sequences if views is not None else ():
-            if views is not None and recipe.name == views.sequence:
-                seen = replace(recipe, name=views.name, cameras="sides")
-                moments = range(views.first, recipe.timesteps, views.every)
-                of = scenes[self.sequences.index(recipe)]
-                scenes.append(SyntheticScene(seen, self.seed, of.motion_seed, scenes[0], moments))
+        for of in [scene for scene in scenes if self.views and scene.recipe.name == self.views.sequence]:
+            assert self.views is not None
+            seen = replace(of.recipe, name=self.views.name, cameras="sides")
+            moments = range(self.views.first, of.recipe.timesteps, self.views.every)
+            scenes.append(SyntheticScene(seen, self.seed, of.motion_seed, scenes[0], moments))
         return scenes
 
     def write(self, folder: Path) -> str:
@@ -67,23 +65,8 @@ class ReferenceCapture:
         return _combined([write_scene(scene, folder / scene.recipe.name) for scene in self.scenes()])
 
     def key(self) -> str:
-        """Return the key that is quoted with figures on this reference.
-
-        It is the same on every machine and changes with the recipe or the drawing version.
-        """
+        """Return the key that is quoted with figures on this reference (`scene_key`)."""
         return _combined([scene_key(scene) for scene in self.scenes()])
-
-    def tiny(self) -> "ReferenceCapture":
-        """Return the same people and motions in three frames of 64x64 pixels from at most three cameras, for tests."""
-        small = [
-            replace(
-                recipe, width=64, height=64, texture_size=128, supersample=1, ring_size=3,
-                fps=3 / sum(segment.seconds for segment in recipe.script),
-            )
-            for recipe in self.sequences
-        ]  # fmt: skip
-        views = None if self.views is None else replace(self.views, first=1, every=1)
-        return replace(self, sequences=tuple(small), views=views)
 
 
 def _combined(keys: list[str]) -> str:

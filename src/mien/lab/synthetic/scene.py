@@ -14,7 +14,6 @@ from jaxtyping import Float, UInt8
 from mien.camera import Camera, look_at
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.face.params import FaceParams
 from mien.lab.synthetic.motion import generate_motion
 from mien.lab.synthetic.off_model import bend_off_model
 from mien.lab.synthetic.painter import develop, draw, paint_wall, to_uint8
@@ -25,11 +24,6 @@ from mien.machine import exact
 from mien.machine.parallel import stream_in_threads
 from mien.tracking.neck_line import fit_neck_lines
 from mien.tracking.tracking import Tracking
-
-_MAX_AZIMUTH = 72.0
-"""Largest angle to either side of a ring, in degrees."""
-_ELEVATIONS = (0.0, 24.0, -16.0)
-"""Elevations of the three rows of a ring in degrees above the face; cameras alternate between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +49,8 @@ class SyntheticScene:
     ) -> None:
         """Prepare a scene; nothing is drawn yet.
 
-        Args:
-            recipe: Recipe of the scene.
-            seed: Decides the person, the light and the room.
-            motion_seed: Decides the motion; None for `seed`. Sequences of one subject share only `seed`.
-            same_person: Another scene with the same person, so that the person is built only once.
-            moments: Timesteps of the recipe that the scene consists of; None for all.
+        `seed` decides the person, the light and the room, `motion_seed` the motion; None for `seed`. A scene with the
+        `same_person` saves building the person. The scene consists of some `moments` of the recipe; None for all.
         """
         self.recipe, self.seed, self.motion_seed = recipe, seed, seed if motion_seed is None else motion_seed
         self._same_person = same_person
@@ -69,7 +59,8 @@ class SyntheticScene:
         coefficients = np.random.default_rng([seed, 0]).standard_normal(count).astype(np.float32)
         self.identity = torch.from_numpy(recipe.identity_scale * np.clip(coefficients, -2, 2)).float()
         self.moments = None if moments is None else tuple(moments)
-        self.face = self._chosen(generate_motion(self.model, self.identity, recipe, self.motion_seed))
+        motion = generate_motion(self.model, self.identity, recipe, self.motion_seed)
+        self.face = motion if moments is None else motion[list(moments)]
         self.drawn_model, self._drawn_face = self.model, self.face
         if recipe.off_model > 0:
             bent = bend_off_model(self.model, self.identity, recipe.off_model, seed)
@@ -77,9 +68,6 @@ class SyntheticScene:
             self.drawn_model, self._drawn_face = bent.model, bent.face(self.face, recipe.fps, seed)
             self.face = replace(self.face, vertex_offsets=bent.offsets)
         self.cameras = _place_cameras(recipe)
-
-    def _chosen(self, face: FaceParams) -> FaceParams:
-        return face if self.moments is None else face[list(self.moments)]
 
     @property
     def timesteps(self) -> int:
@@ -109,9 +97,8 @@ class SyntheticScene:
 
     def vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """Return the true vertices of the head in the face model's topology, in world space, in metres."""
-        face = self._drawn_face[timestep]
-        T = head_pose(face)
-        return torch.from_numpy(exact.rotated(self._poser(face), T[:3, :3], T[:3, 3]))
+        T = head_pose(self._drawn_face[timestep])
+        return torch.from_numpy(exact.rotated(self.head_vertices(timestep).numpy(), T[:3, :3], T[:3, 3]))
 
     def head_vertices(self, timestep: int) -> Float[torch.Tensor, "v 3"]:
         """Return the true vertices of the head in the head frame, in metres."""
@@ -156,27 +143,20 @@ class SyntheticScene:
             torch.set_num_threads(before)
 
     def landmarks(self, camera: int = 0) -> Float[np.ndarray, "t l 2"]:
-        """Return MediaPipe's 478 points of every timestep in pixels, from the face model's embedding.
-
-        Hidden points are included.
-        """
-        projected = []
-        for timestep in range(self.timesteps):
-            points = landmark_positions(self.model, self.vertices(timestep).numpy())
-            projected.append(project(self.cameras[camera], points)[0])
-        return np.stack(projected)
+        """Return MediaPipe's 478 points of each timestep in pixels, also hidden ones, as the face model has them."""
+        vertices = [self.vertices(timestep).numpy() for timestep in range(self.timesteps)]
+        return np.stack([project(self.cameras[camera], landmark_positions(self.model, one))[0] for one in vertices])
 
     def tracking(self) -> Tracking:
         """Return the true tracking. With `recipe.off_model` only head pose, cameras and the neutral shape are true."""
-        timesteps = self.timesteps
         return Tracking(
             face_model=self.model.name,
             face_model_hash=self.model.content_hash,
             face=self.face,
-            valid=torch.ones(timesteps, dtype=torch.bool),
+            valid=torch.ones(self.timesteps, dtype=torch.bool),
             cameras=self.cameras,
             neck_lines=fit_neck_lines(self.model, self.face, self.cameras),
-            residuals=torch.zeros(timesteps, len(self.cameras)),
+            residuals=torch.zeros(self.timesteps, len(self.cameras)),
             settings={
                 "kind": "synthetic",
                 "seed": self.seed,
@@ -211,9 +191,9 @@ class SyntheticScene:
 def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
     """Return one camera per camera_id, all in one world frame.
 
-    The first is at the world's origin and looks along -z at the head, `recipe.distance` away. The others of a ring look
-    at the same point from the same distance. They are spread evenly from one side to the other, in three rows. Those
-    of `SIDES` look at it from the same distance as well.
+    The first is at the world's origin and looks along -z at the head, `recipe.distance` away. The others look at the
+    same point from the same distance: those of `SIDES`, or a ring, which is spread evenly over 72 degrees to both
+    sides, in three rows that alternate.
     """
     focal = recipe.focal * recipe.width
     K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])
@@ -222,7 +202,7 @@ def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
     target = torch.tensor([0.0, 0.0, -recipe.distance])
     for index, name in enumerate(recipe.camera_ids[1:], 1):
         share = (index - 1) / max(len(recipe.camera_ids) - 2, 1)
-        around = _MAX_AZIMUTH * (2 * share - 1), _ELEVATIONS[index % len(_ELEVATIONS)]
+        around = 72.0 * (2 * share - 1), (0.0, 24.0, -16.0)[index % 3]
         azimuth, elevation = map(math.radians, SIDES[name] if recipe.cameras == "sides" else around)
         away = torch.tensor([
             math.sin(azimuth) * math.cos(elevation),

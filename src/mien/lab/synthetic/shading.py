@@ -128,14 +128,9 @@ def shade_eye(
 ) -> Float[np.ndarray, "n 3"]:
     """Shade an eye: white with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
 
-    Args:
-        local: Directions from the eyeball's centre, +z along the line of sight.
-        normals: The same directions in the head frame.
-        axis: The line of sight.
-        under_lid: Distance below the upper lid's rim, in metres.
-        views: Directions towards the camera.
-        light: The scene's light.
-        iris: Size (sine of the angle to its rim) and colour of the iris, and whether the eye is wet.
+    `local` are directions from the eyeball's centre, +z along the line of sight; `normals` the same and `axis` the line
+    of sight, both in the head frame. `under_lid` is the distance below the upper lid's rim, in metres, and `iris` its
+    size (sine of the angle to its rim), its colour, and whether the eye is wet.
     """
     size, color, is_wet = iris
     radius = exact.length(local[:, :2])

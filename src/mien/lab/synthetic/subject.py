@@ -1,6 +1,8 @@
 """A synthetic person: the face model's head and everything beyond the face model, ready to be posed and drawn."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 import torch
@@ -10,8 +12,8 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.synthetic.accessories import Glasses, RigidMesh, build_glasses, build_shirt, stack_meshes
 from mien.lab.synthetic.anatomy import CHIN, SIDES, Anatomy, measure_anatomy
-from mien.lab.synthetic.facial_hair import RootedStrands, SkinStrands, grow_beard, grow_brows, grow_lashes
-from mien.lab.synthetic.hair import DrapedStrands, Strands, grow_long_hair, grow_short_hair, ribbon_faces
+from mien.lab.synthetic.facial_hair import Lashes, RootedStrands, SkinStrands, grow_beard, grow_brows
+from mien.lab.synthetic.hair import DrapedStrands, HeadPose, Strands, grow_long_hair, grow_short_hair, ribbon_faces
 from mien.lab.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
 from mien.lab.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions
@@ -19,8 +21,8 @@ from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.skin import SkinTextures, paint_skin
 from mien.machine import exact
 
-SKIN, EYE, TEETH, MOUTH, HAIR, SHIRT, FRAME = range(7)
-"""Materials."""
+Hair = Strands | DrapedStrands | RootedStrands | SkinStrands | Lashes
+Material = IntEnum("Material", ("SKIN", "EYE", "TEETH", "MOUTH", "HAIR", "SHIRT", "FRAME"), start=0)
 
 _HAIR_COLORS = np.array(
     [[0.018, 0.012, 0.009], [0.045, 0.026, 0.016], [0.10, 0.055, 0.028], [0.20, 0.12, 0.058], [0.13, 0.045, 0.02]],
@@ -64,10 +66,8 @@ class Subject:
     iris_color: Float[np.ndarray, " 3"]
     wet_eyes: bool
     shirt_color: Float[np.ndarray, " 3"]
-    hair: Strands | DrapedStrands | None
-    on_skin: tuple[SkinStrands | RootedStrands, ...]
-    """Brows and beard."""
-    lashes: bool
+    hair: tuple[Hair, ...]
+    """Of the scalp, brows, beard and lashes, if present, in the order of `faces`."""
     glasses: Glasses | None
     shirt: RigidMesh | None
     faces: Int[np.ndarray, "f 3"]
@@ -78,17 +78,11 @@ class Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedSubject:
+class PosedSubject(HeadPose):
     """A subject at one timestep, in the head frame."""
 
-    head: Float[np.ndarray, "v 3"]
-    """The face model's vertices."""
-    normals: Float[np.ndarray, "v 3"]
-    landmarks: Float[np.ndarray, "l 3"]
-    eye_centers: Float[np.ndarray, "2 3"]
     strands: tuple[Strands, ...]
-    """Hair, brows, beard and lashes, if present, in the order of the subject's `faces`."""
-    T_head_shoulders: Float[np.ndarray, "4 4"]
+    """The subject's hair."""
     R_world_head: Float[np.ndarray, "3 3"]
     viewpoint: Float[np.ndarray, " 3"]
     """Position of the camera."""
@@ -100,19 +94,22 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     anatomy = measure_anatomy(model, identity)
     hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
     collar, size = _collar(anatomy)
-    hair = _grow_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
+    eyes = tuple(_eye(anatomy, side) for side in SIDES)
+    scalp = _scalp_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
+    hair: list[Hair] = [] if scalp is None else [scalp]
+    if recipe.brows_and_lashes:
+        hair.append(grow_brows(anatomy, 0.7 * hair_color, seed))
+    if recipe.beard > 0:
+        hair.append(grow_beard(anatomy, 0.8 * hair_color, recipe.beard, seed))
+    if recipe.brows_and_lashes:
+        hair.append(Lashes(eyes[0].radius))
     glasses = build_glasses(anatomy) if recipe.glasses else None
     shirt = build_shirt(collar, size, _shoulder_points(anatomy, collar, size), seed) if recipe.clothes else None
-    on_skin: tuple[SkinStrands | RootedStrands, ...] = ()
-    if recipe.brows_and_lashes:
-        on_skin += (grow_brows(anatomy, 0.7 * hair_color, seed),)
-    if recipe.beard > 0:
-        on_skin += (grow_beard(anatomy, 0.8 * hair_color, recipe.beard, seed),)
-    kept = _uncovered_faces(anatomy, collar) if recipe.clothes else np.arange(len(anatomy.faces))
-    faces, materials = _all_faces(
-        anatomy, kept, _strand_sizes(hair, on_skin, recipe.brows_and_lashes, anatomy), glasses, shirt
-    )
-    occluders = _occluders(anatomy, _at_rest(hair), glasses, shirt) if recipe.detail.shadows else None
+    # Triangles deep under the shirt are left out.
+    is_kept = anatomy.vertices[anatomy.faces].mean(1)[:, 1] > (collar[1] - 0.065 if recipe.clothes else -np.inf)
+    kept = np.flatnonzero(is_kept)
+    faces, materials = _all_faces(anatomy, kept, hair, glasses, shirt)
+    occluders = _occluders(anatomy, scalp, glasses, shirt) if recipe.detail.shadows else None
     return Subject(
         model=model,
         poser=HeadPoser(model, identity),
@@ -120,13 +117,11 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
         textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
         lighting=studio_lighting(seed),
         visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders),
-        eyes=tuple(_eye(anatomy, side) for side in SIDES),
+        eyes=eyes,
         iris_color=_IRIS_COLORS[random.integers(len(_IRIS_COLORS))],
         wet_eyes=recipe.detail.wet_eyes,
         shirt_color=_SHIRT_COLORS[random.integers(len(_SHIRT_COLORS))],
-        hair=hair,
-        on_skin=on_skin,
-        lashes=recipe.brows_and_lashes,
+        hair=tuple(hair),
         glasses=glasses,
         shirt=shirt,
         faces=faces,
@@ -144,49 +139,21 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
     T_world_head = head_pose(face)
     R = T_world_head[:3, :3]
     centers = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
-    T_head_shoulders = _shoulders(subject, face, R)
+    pose = HeadPose(head, normals, landmarks, centers, _shoulders(subject, face, R))
     return PosedSubject(
-        head=head,
-        normals=normals,
-        landmarks=landmarks,
-        eye_centers=centers,
-        strands=_posed_strands(subject, head, normals, landmarks, centers, T_head_shoulders),
-        T_head_shoulders=T_head_shoulders,
+        **vars(pose),
+        strands=tuple(hair.posed(pose) for hair in subject.hair),
         R_world_head=R,
         viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
     )
 
 
-def _grow_hair(
+def _scalp_hair(
     anatomy: Anatomy, recipe: SyntheticRecipe, color: Float[np.ndarray, " 3"], collar: float, seed: int
 ) -> Strands | DrapedStrands | None:
-    if recipe.hair == "none":
-        return None
-    return (
-        grow_long_hair(anatomy, color, collar, seed) if recipe.hair == "long" else grow_short_hair(anatomy, color, seed)
-    )
-
-
-def _at_rest(hair: Strands | DrapedStrands | None) -> Strands | None:
-    return hair.rest if isinstance(hair, DrapedStrands) else hair
-
-
-def _posed_strands(
-    subject: Subject,
-    head: np.ndarray,
-    normals: np.ndarray,
-    landmarks: np.ndarray,
-    eye_centers: np.ndarray,
-    T_head_shoulders: np.ndarray,
-) -> tuple[Strands, ...]:
-    strands = []
-    if subject.hair is not None:
-        hair = subject.hair
-        strands.append(hair.posed(T_head_shoulders) if isinstance(hair, DrapedStrands) else hair)
-    strands += [part.posed(subject.anatomy, head, normals) for part in subject.on_skin]
-    if subject.lashes:
-        strands.append(grow_lashes(landmarks, eye_centers, subject.eyes[0].radius))
-    return tuple(strands)
+    if recipe.hair == "long":
+        return grow_long_hair(anatomy, color, collar, seed)
+    return grow_short_hair(anatomy, color, seed) if recipe.hair == "short" else None
 
 
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
@@ -236,11 +203,6 @@ def _collar(anatomy: Anatomy) -> tuple[Float[np.ndarray, " 3"], tuple[float, flo
     return np.array([0, y, 0.5 * (front + back)], np.float32), (half_width, 0.5 * float(front - back))
 
 
-def _uncovered_faces(anatomy: Anatomy, collar: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " m"]:
-    """Return the triangles that are not deep under the shirt."""
-    return np.flatnonzero(anatomy.vertices[anatomy.faces].mean(1)[:, 1] > collar[1] - 0.065)
-
-
 def _shoulder_points(
     anatomy: Anatomy, collar: Float[np.ndarray, " 3"], size: tuple[float, float]
 ) -> Float[np.ndarray, "p 3"]:
@@ -254,12 +216,13 @@ def _shoulder_points(
 
 
 def _occluders(
-    anatomy: Anatomy, hair: Strands | None, glasses: Glasses | None, shirt: RigidMesh | None
+    anatomy: Anatomy, scalp: Strands | DrapedStrands | None, glasses: Glasses | None, shirt: RigidMesh | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what casts shadows: the head at rest, every fourth strand three times as wide, the rims, the shoulders."""
     closed = ~anatomy.region("eyes", "irises", "teeth", "tongue", "mouth", "eye_sockets")
     meshes = [(anatomy.vertices, anatomy.faces[closed])]
-    if hair is not None:
+    if scalp is not None:
+        hair = scalp.rest if isinstance(scalp, DrapedStrands) else scalp
         wide = Strands(hair.points[::4], 3.0 * hair.widths[::4], hair.colors[::4], hair.outwards[::4])
         # Ribbons that face the skull's centre lie flat on the skin.
         meshes.append((wide.ribbon_vertices(anatomy.skull_center), ribbon_faces(*wide.widths.shape)))
@@ -269,33 +232,18 @@ def _occluders(
     return stack_meshes(meshes)
 
 
-def _strand_sizes(
-    hair: Strands | DrapedStrands | None,
-    on_skin: tuple[SkinStrands | RootedStrands, ...],
-    lashes: bool,
-    anatomy: Anatomy,
-) -> list[tuple[int, int]]:
-    """Return the numbers of strands and of points per strand of all hair, in drawing order."""
-    rest = _at_rest(hair)
-    sizes = [] if rest is None else [rest.widths.shape]
-    sizes += [strands.widths.shape for strands in on_skin]
-    if lashes:
-        sizes.append(grow_lashes(anatomy.landmarks, np.zeros((2, 3)), 0.017).widths.shape)
-    return sizes
-
-
 def _all_faces(
     anatomy: Anatomy,
     kept: np.ndarray,
-    strand_sizes: list[tuple[int, int]],
+    hair: Sequence[Hair],
     glasses: Glasses | None,
     shirt: RigidMesh | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles over `opaque_vertices` and their materials."""
-    of_model = np.full(len(anatomy.faces), SKIN)
-    of_model[anatomy.region("eyes", "irises")] = EYE
-    of_model[anatomy.region("teeth")] = TEETH
-    of_model[anatomy.region("mouth", "tongue", "eye_sockets")] = MOUTH
+    of_model = np.full(len(anatomy.faces), int(Material.SKIN))
+    of_model[anatomy.region("eyes", "irises")] = Material.EYE
+    of_model[anatomy.region("teeth")] = Material.TEETH
+    of_model[anatomy.region("mouth", "tongue", "eye_sockets")] = Material.MOUTH
     faces, materials, start = [anatomy.faces[kept]], [of_model[kept]], len(anatomy.vertices)
 
     def add(part_faces: np.ndarray, vertices: int, material: int) -> None:
@@ -304,10 +252,12 @@ def _all_faces(
         materials.append(np.full(len(part_faces), material))
         start += vertices
 
-    for strands, points in strand_sizes:
-        add(ribbon_faces(strands, points), 2 * strands * points, HAIR)
+    rest = HeadPose(anatomy.vertices, anatomy.normals, anatomy.landmarks, np.zeros((2, 3)), np.eye(4))
+    for part in hair:
+        strands, points = part.posed(rest).widths.shape
+        add(ribbon_faces(strands, points), 2 * strands * points, Material.HAIR)
     if glasses is not None:
-        add(glasses.frame.faces, len(glasses.frame.vertices), FRAME)
+        add(glasses.frame.faces, len(glasses.frame.vertices), Material.FRAME)
     if shirt is not None:
-        add(shirt.faces, len(shirt.vertices), SHIRT)
+        add(shirt.faces, len(shirt.vertices), Material.SHIRT)
     return np.concatenate(faces), np.concatenate(materials)

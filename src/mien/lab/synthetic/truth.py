@@ -1,6 +1,5 @@
 """The exact truth of a synthetic capture, for measuring trackers in millimetres and pixels."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,9 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien.disk.files import read_arrays, read_json, write_arrays, write_json
-from mien.errors import UserError
-from mien.lab.synthetic.anatomy import CHIN, FOREHEAD_TOP, Anatomy, measure_anatomy
+from mien.disk.files import expect_whole, read_arrays, read_json, write_arrays, write_json
+from mien.lab.synthetic.anatomy import CHIN, EAR, FOREHEAD_TOP, Anatomy, measure_anatomy
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.machine import exact
 from mien.tracking.files import read_tracking, write_tracking
@@ -20,9 +18,6 @@ FORMAT, VERSION = "mien.synthetic_truth", 1
 _JSON, _ARRAYS, _TRACKING = "truth.json", "truth.safetensors", "tracking"
 _METER, _PIXEL = 1e-5, 1 / 16
 """Units of the stored 16-bit numbers: 10 micrometres, a sixteenth of a pixel."""
-_MAX_STORED = np.iinfo(np.int16).max
-_REMEDY = "delete the folder and draw the capture again"
-_EAR = 234
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,21 +40,24 @@ class Truth:
         poses = self.tracking.face.T_world_head.numpy()
         return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
 
+    @property
+    def stored(self) -> dict[str, np.ndarray]:
+        """The arrays as they are stored."""
+        return {
+            "vertex_index": self.vertex_index.astype(np.int32),
+            "vertices": _packed(self.vertices, _METER),
+            "landmarks": _packed(self.landmarks, _PIXEL),
+        }
+
 
 def truth_of(scene: SyntheticScene) -> Truth:
     """Return the truth of a scene, rounded as it is stored."""
-    return Truth(scene.tracking(), *surface_of(scene))
-
-
-def surface_of(
-    scene: SyntheticScene,
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
-    """Return `vertex_index`, `vertices` and `landmarks` of the truth."""
     index = face_region(measure_anatomy(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
-    return index, _unpacked(_packed(vertices, _METER), _METER), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
+    rounded = (_unpacked(_packed(values, unit), unit) for values, unit in ((vertices, _METER), (landmarks, _PIXEL)))
+    return Truth(scene.tracking(), index, *rounded)
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
@@ -67,46 +65,31 @@ def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:
     skin = np.unique(anatomy.faces[anatomy.skin & ~anatomy.region("ears", "neck", "scalp")])
     points, marks = anatomy.vertices[skin], anatomy.landmarks
     inside = (points[:, 1] > marks[CHIN, 1] - 0.005) & (points[:, 1] < marks[FOREHEAD_TOP, 1])
-    return skin[inside & (points[:, 2] > marks[_EAR, 2])].astype(np.int64)
-
-
-def hash_surface(digest: "hashlib._Hash", scene: SyntheticScene) -> None:
-    """Add the numbers of `surface_of` to a hash."""
-    index, vertices, landmarks = surface_of(scene)
-    digest.update(index.astype(np.int32).tobytes())
-    digest.update(_packed(vertices, _METER).tobytes() + _packed(landmarks, _PIXEL).tobytes())
+    return skin[inside & (points[:, 2] > marks[EAR, 2])].astype(np.int64)
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
     """Write FOLDER/truth.json, truth.safetensors and tracking/. The json comes last."""
     write_tracking(folder / _TRACKING, truth.tracking)
-    arrays = {
-        "vertex_index": truth.vertex_index.astype(np.int32),
-        "vertices": _packed(truth.vertices, _METER),
-        "landmarks": _packed(truth.landmarks, _PIXEL),
-    }
-    write_arrays(folder / _ARRAYS, arrays)
-    content = {"metre": _METER, "pixel": _PIXEL}
-    write_json(folder / _JSON, FORMAT, VERSION, content)
+    write_arrays(folder / _ARRAYS, truth.stored)
+    write_json(folder / _JSON, FORMAT, VERSION, {"metre": _METER, "pixel": _PIXEL})
 
 
 def read_truth(folder: Path) -> Truth:
     """Read what `write_truth` wrote."""
     content = read_json(folder / _JSON, FORMAT, VERSION)
     arrays = read_arrays(folder / _ARRAYS)
-    try:
+    with expect_whole(folder / _JSON, "delete the folder and draw the capture again"):
         return Truth(
             tracking=read_tracking(folder / _TRACKING),
             vertex_index=arrays["vertex_index"].astype(np.int64),
-            vertices=_unpacked(arrays["vertices"], float(content["metre"])),
-            landmarks=_unpacked(arrays["landmarks"], float(content["pixel"])),
+            vertices=_unpacked(arrays["vertices"], content["metre"]),
+            landmarks=_unpacked(arrays["landmarks"], content["pixel"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{folder / _JSON}: incomplete ({error}); {_REMEDY}") from None
 
 
 def _packed(values: np.ndarray, unit: float) -> np.ndarray:
-    return np.clip(np.rint(values / unit), -_MAX_STORED, _MAX_STORED).astype(np.int16)
+    return np.clip(np.rint(values / unit), -32767, 32767).astype(np.int16)
 
 
 def _unpacked(values: np.ndarray, unit: float) -> np.ndarray:

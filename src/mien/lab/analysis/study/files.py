@@ -1,29 +1,52 @@
-"""A study on disk: the key, which says what the page's opaque names stand for, and the answers. Needs no torch."""
+"""A study on disk: its settings, the key, which says what the page's opaque names stand for, and the answers.
+
+Needs no torch.
+"""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from mien.disk.config import Range, check_ranges
 from mien.disk.files import expect_whole, read_json, write_json
-from mien.disk.inside import is_one_line, listed
-from mien.disk.limits import checked_whole
+from mien.disk.inside import listed
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
-from mien.lab.analysis.study.shuffling import shuffled
 
 QUESTIONS = {"quality": "visual quality", "expression": "expression accuracy"}
 """The questions of the study, by their names in answer files (MonoGaussianAvatar, supplement A.5)."""
 MOST_RUNS = 8
 """Largest number of runs beside the truth."""
-ANSWERS, KEY, VERSION = "mien.study_answers", "mien.study_key", 1
+ANSWERS, VERSION = "mien.study_answers", 1
+_KEY = "mien.study_key"
 _KEY_REMEDY = "make the study again with the same seed and runs"
 _AGAIN = "ask the participant to save it again, or leave it out"
-_MAX_BYTES = 1 << 20
-"""Largest answer file, in bytes. 200 clips take some 60 kB."""
-_NAME = re.compile(r"[0-9a-f]{8,32}")
-_MAX_TIMESTEP = 1 << 40
+_MASK = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """Settings of a study's page."""
+
+    clips: Annotated[int, Range(1, 200)] = 10
+    """Largest number of clips, spread evenly over the workspaces. The paper showed 10."""
+    seconds: Annotated[float, Range(0.1, 60)] = 4.0
+    """Longest clip, in seconds. A clip never crosses the end of a held-out part."""
+    side: Annotated[int, Range(64, 1024)] = 384
+    """Side of each picture in pixels: a multiple of H.264's blocks, so that no block holds pixels of two tiles."""
+    megabytes: Annotated[float, Range(1, 1000)] = 30.0
+    """Largest size of the page, in millions of bytes. Videos are compressed until they fit."""
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    """Seed of the choice of clips and of the page's opaque names. The same seed, runs and settings give the same
+    page."""
+
+    def check(self) -> None:
+        """Check that all numbers are in their ranges."""
+        check_ranges(self, lambda name: f"--{name}")
+        if self.side % 16:
+            raise UserError(f"--side {self.side}: give a multiple of 16, for example {max(64, self.side // 16 * 16)}")
 
 
 @dataclass(frozen=True)
@@ -82,26 +105,15 @@ def key_path(page: Path) -> Path:
 
 def write_key(path: Path, key: StudyKey) -> None:
     """Write the key of a study."""
-    write_json(path, KEY, VERSION, {**asdict(key), "runs": list(key.runs), "clips": [asdict(one) for one in key.clips]})
+    write_json(path, _KEY, VERSION, asdict(key))
 
 
 def read_key(path: Path) -> StudyKey:
     """Read the key of a study."""
-    content = read_json(path, KEY, VERSION, "`mien study make`", _KEY_REMEDY)
+    content = read_json(path, _KEY, VERSION, "`mien study make`", _KEY_REMEDY)
     with expect_whole(path, _KEY_REMEDY):
-        key = StudyKey(
-            _opaque(content["study"]),
-            checked_whole(content["seed"], 0, 2**63 - 1),
-            tuple(map(_label, content["runs"])),
-            tuple(_key_clip(entry) for entry in content["clips"]),
-        )
-        if not key.clips or len({clip.name for clip in key.clips}) < len(key.clips):
-            raise ValueError("its clips are missing or not unique")
-        if not 2 <= len(key.runs) <= MOST_RUNS:
-            raise ValueError(f"it has {len(key.runs)} runs")
-        if any(sorted(clip.tiles.values()) != sorted(key.runs) for clip in key.clips):
-            raise ValueError("a clip does not show each run once")
-    return key
+        clips = tuple(KeyClip(**entry) for entry in content["clips"])
+        return StudyKey(content["study"], content["seed"], tuple(content["runs"]), clips)
 
 
 def read_answers(path: Path, key: StudyKey) -> Answers:
@@ -152,7 +164,7 @@ def _answer_files(paths: Sequence[Path]) -> list[Path]:
 
 def _answer_json(path: Path) -> Mapping[str, Any]:
     try:
-        content = parse_json(read_bytes(path, _MAX_BYTES).decode("utf-8"), unique_names=True)
+        content = parse_json(read_bytes(path, 1 << 20).decode("utf-8"), unique_names=True)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; give the files that participants saved") from None
     except (OSError, ValueError) as error:
@@ -174,26 +186,43 @@ def _answer(entry: Mapping[str, Any], clip: KeyClip, key: StudyKey, participant:
     return Answer(clip, tuple(clip.tiles[name] for name in shown), choices)
 
 
-def _key_clip(entry: Mapping[str, Any]) -> KeyClip:
-    tiles = {_opaque(tile): _label(run) for tile, run in entry["tiles"].items()}
-    return KeyClip(
-        _opaque(entry["name"]),
-        _label(entry["workspace"]),
-        _label(entry["sequence"]),
-        _label(entry["camera_id"]),
-        checked_whole(entry["first"], 0, _MAX_TIMESTEP),
-        checked_whole(entry["timesteps"], 1, _MAX_TIMESTEP),
-        tiles,
-    )
-
-
 def _opaque(name: object) -> str:
-    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+    if not isinstance(name, str) or re.fullmatch(r"[0-9a-f]{8,32}", name) is None:
         raise ValueError(f"{name!r:.40} is not a name of a page")
     return name
 
 
-def _label(name: object) -> str:
-    if not is_one_line(name) or not name:
-        raise ValueError(f"{name!r:.40} is not a name")
-    return str(name)
+def shuffled(names: Sequence[str], study: str, participant: str, what: str) -> list[str]:
+    """Opaque names of clips or tiles in this participant's order (Fisher-Yates), which is the same for any given order.
+
+    page.html has the same function, and a test compares both. The numbers come from sfc32 (Doty-Humphrey, PractRand:
+    128 bits of state, of which 32 count), which is short in both languages. Its state is a hash (FNV-1a) of the study,
+    the participant and `what` (the clip's name, or `clips` for their order), so that an answer file alone tells the
+    order again.
+    """
+    order, numbers = sorted(names), _numbers(f"{study}/{participant}/{what}")
+    for last in range(len(order) - 1, 0, -1):
+        other = next(numbers) * (last + 1) >> 32
+        order[last], order[other] = order[other], order[last]
+    return order
+
+
+def _numbers(text: str) -> Iterator[int]:
+    """Random whole numbers below 2^32."""
+    a, b, c = (_hash(f"{salt}{text}") for salt in "012")
+    count = 1
+    for index in range(1 << 62):
+        value = (a + b + count) & _MASK
+        count = (count + 1) & _MASK
+        a = b ^ (b >> 9)
+        b = (c + (c << 3)) & _MASK
+        c = (((c << 21) | (c >> 11)) + value) & _MASK
+        if index >= 15:  # until all bits of the state are mixed
+            yield value
+
+
+def _hash(text: str) -> int:
+    value = 0x811C9DC5
+    for byte in text.encode("ascii"):
+        value = ((value ^ byte) * 0x01000193) & _MASK
+    return value

@@ -13,23 +13,18 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import stdtrit
 
 from mien.lab.analysis.study.files import QUESTIONS, Answers, StudyKey
+from mien.lab.benchmarking.comparing import markdown
 
 CONFIDENCE = 0.95
 """Share of the intervals that hold the true percentage, over many studies."""
 FORMAT, VERSION = "mien.study_tally", 1
-_POSITIONS = "ABCDEFGH"
 
 
 def tally_content(key: StudyKey, answers: Sequence[Answers]) -> dict[str, Any]:
-    """The percentages of every run, with intervals, as a json object.
-
-    Args:
-        key: The study's key.
-        answers: One entry for each participant, at least one.
-    """
-    assert answers, "no answers"
+    """The percentages of every run, with intervals, as a json object. There is at least one participant."""
     return {
         "study": key.study,
         "participants": len(answers),
@@ -73,7 +68,7 @@ def _positions(question: str, answers: Sequence[Answers]) -> dict[str, float]:
     """How often each place from left to right was chosen, in percent. Equal shares mean that order did not matter."""
     places = [one.shown.index(one.choices[question]) for each in answers for one in each.clips]
     count = len(answers[0].clips[0].shown)
-    return {_POSITIONS[place]: round(100 * places.count(place) / len(places), 2) for place in range(count)}
+    return {"ABCDEFGH"[place]: round(100 * places.count(place) / len(places), 2) for place in range(count)}
 
 
 def interval(shares: Float[np.ndarray, " p"], clips: int) -> tuple[float, float]:
@@ -103,38 +98,22 @@ def wilson(share: float, count: float, z: float) -> tuple[float, float]:
 
 
 def student_quantile(degrees: int) -> float:
-    """The two-sided quantile of Student's t for `CONFIDENCE`, by the series of Abramowitz and Stegun (26.7.5).
-
-    It is 1 % too small for 2 degrees of freedom, and far closer for more. For 1 degree it is exact.
-    """
-    if degrees == 1:
-        return math.tan(math.pi * CONFIDENCE / 2)
-    z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
-    terms = (
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
-    )
-    return z + sum(term / degrees ** (power + 1) for power, term in enumerate(terms))
+    """The two-sided quantile of Student's t for `CONFIDENCE`."""
+    return float(stdtrit(degrees, 0.5 + CONFIDENCE / 2))
 
 
 def tally_text(content: dict[str, Any]) -> str:
     """The percentages as a table in markdown, with what a reader has to know."""
-    heads = " | ".join(name[0].upper() + name[1:] for name in QUESTIONS.values())
-    lines = [f"| Run | {heads} |", "|---|" + "---|" * len(QUESTIONS)]
-    for run, entries in content["runs"].items():
-        cells = [
-            f"{entries[question]['percent']:.1f} % ({entries[question]['low']:.1f} to {entries[question]['high']:.1f})"
-            for question in QUESTIONS
-        ]
-        lines.append(f"| {run} | {' | '.join(cells)} |")
-    chance = 100 / len(content["runs"])
-    lines += [
-        "",
+    heads = ["Run", *(name.capitalize() for name in QUESTIONS.values())]
+    cells = [
+        (run, *(f"{one['percent']:.1f} % ({one['low']:.1f} to {one['high']:.1f})" for one in entries.values()))
+        for run, entries in content["runs"].items()
+    ]
+    lines = [
+        markdown(heads, cells),
         f"{content['participants']} participants, {content['clips']} clips, {content['judgements']} judgements of each "
         f"question. In brackets: {100 * content['confidence']:.0f} % confidence interval over participants. "
-        f"Chance is {chance:.1f} %.",
+        f"Chance is {100 / len(content['runs']):.1f} %.",
     ]
     for question, name in QUESTIONS.items():
         places = ", ".join(f"{place} {share:.0f} %" for place, share in content["positions"][question].items())

@@ -1,0 +1,491 @@
+"""The analysis of HeadGaS (Dhamo et al., ECCV 2024): the figures and the ablation table of the paper's supplement."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mien.avatar.headgas.avatar import HeadGas
+from mien.avatar.headgas.settings import HeadGasConfig, Variant
+from mien.camera import Camera
+from mien.evaluation.experiment import avatar_image, target_image
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.gaussians import Gaussians, world_means
+from mien.lab.analysis.context import Context, Run
+from mien.lab.analysis.measuring import (
+    draw_avatar,
+    draw_mesh,
+    head_camera,
+    head_picture,
+    held_out_scores,
+    labeled,
+    measure_drawing,
+    mouth_camera,
+    perceptual_metric,
+    score_cells,
+)
+from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
+from mien.lab.benchmarking.timing import format_machine, measure_machine
+from mien.machine.progress import track_progress
+from mien.machine.terminal import counted
+from mien.media.pictures import picture_grid, side_by_side
+from mien.media.video import write_video
+from mien.pages.plots import Axes, Series
+from mien.render.camera_paths import turned_camera
+from mien.runtime.filmed import head_angles
+
+SIDE = 224
+"""Width and height of a picture, in pixels."""
+_FPS = 25.0
+_FAINT = 1 / 255
+"""Opacity below which a Gaussian is not drawn."""
+_REACH = 1.4
+"""Largest multiple of the training maximum: the supplement's own."""
+SIZES = {512: 4.0, 1024: 5.0, 2048: 8.6}
+"""Side of a square picture in pixels -> mean milliseconds of a frame, for 21,000 to 37,000 Gaussians on a GPU."""
+ABLATIONS: dict[str, tuple[str, int | None, float | None, float]] = {
+    "no_blending": ("without blending", 135_000, 8.0, 29.38),
+    "change_all": ("change all", 97_000, 12.0, 29.65),
+    "delta": ("with delta(mu, R)", 234_000, 19.0, 29.83),
+    "no_mlp": ("without the network", 295_000, 10.0, 32.08),
+    "no_perceptual": ("without the perceptual loss", None, None, 32.11),
+    "full": ("full", 28_000, 4.0, 32.50),
+}
+"""Variant -> its name, and Gaussians, milliseconds of a frame and PSNR in the paper, in the order of its Table 1."""
+TIMED_SIDE = 512
+"""Side of the pictures of ablations that are timed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """The range of a training."""
+
+    highest: Float[Tensor, " e"]
+    """The largest value of each expression coefficient."""
+    yaws: tuple[float, float]
+    """Lowest and highest yaw of the camera as the head sees it, in radians. Positive is the subject's left."""
+    yaw_at_rest: float
+    """The same for the subject and the run's camera, in radians."""
+
+
+def trained_range(context: Context) -> Trained:
+    """The range of the run's training, from its avatar, or from its sequences if the avatar does not hold it."""
+    avatar, filmed = context.avatar, context.avatar.filmed
+    at_rest = float(_yaws(avatar.subject, context.camera)[0])
+    if filmed is not None:
+        low, high = (float(value) for value in filmed.head_angles[0])
+        count = avatar.subject.expression.shape[1]
+        return Trained(torch.from_numpy(filmed.highest[:count].copy()), (low, high), at_rest)
+    trackings = [one.tracking for one in context.sequences]
+    yaws = np.concatenate([_yaws(one.face, camera) for one in trackings for camera in one.cameras])
+    highest = torch.cat([one.face.expression for one in trackings]).amax(0)
+    return Trained(highest, (float(yaws.min()), float(yaws.max())), at_rest)
+
+
+def _yaws(face: FaceParams, camera: Camera) -> np.ndarray:
+    parts = (face.head_rotation, face.head_translation, camera.position)
+    return head_angles(*(part.detach().cpu().numpy() for part in parts))[:, 0]
+
+
+def with_expression(face: FaceParams, index: int, value: float) -> FaceParams:
+    """The face with one expression coefficient set to a value."""
+    expression = face.expression.clone()
+    expression[:, index] = value
+    return replace(face, expression=expression)
+
+
+def busy_face(context: Context) -> FaceParams:
+    """The subject with all expressions at a tenth of their largest bound, so that every basis is read."""
+    subject, bounds = context.avatar.subject, context.avatar.face_model.expression_bounds
+    return replace(subject, expression=subject.expression + 0.1 * bounds[:, 1])
+
+
+def _mesh_and_avatar(context: Context, face: FaceParams, camera: Camera) -> np.ndarray:
+    return side_by_side([draw_mesh(context.avatar.face_model, face, camera), draw_avatar(context.avatar, face, camera)])
+
+
+def basis(context: Context) -> Result:
+    """The avatar with each expression alone, and the mesh with the same expression: Fig. 1."""
+    avatar, model = context.avatar, context.avatar.face_model
+    assert isinstance(avatar, HeadGas)
+    start, added = start_of_bases(avatar.subject, model)
+    camera = head_camera(model, start, context.camera, SIDE)
+
+    def alone(index: int, value: float) -> FaceParams:
+        return with_expression(start, index, float(start.expression[0, index]) * added + value)
+
+    names, highest = model.expression_names, trained_range(context).highest
+    first, mesh = draw_avatar(avatar, start, camera).astype(np.float32), model(start)[0]
+    rows = []
+    for index in track_progress(range(len(names)), "basis", len(names)):
+        value = float(model.expression_bounds[index, 1].clamp(0, 1))
+        face = alone(index, value)
+        change = float(np.abs(draw_avatar(avatar, face, camera) - first).mean())
+        moved = 1e3 * float((model(face)[0] - mesh).norm(dim=-1).max())
+        rows.append((names[index], round(value, 3), round(float(highest[index]), 3), round(change, 3), round(moved, 2)))
+    # What training reached farthest, as a share of what is drawn, comes first.
+    order = sorted(range(len(names)), key=lambda i: (-min(rows[i][2] / max(rows[i][1], 1e-6), 1), -rows[i][4], i))
+    shown = [index for index in order if rows[index][1] > 0][:12]
+    pairs = [
+        labeled(_mesh_and_avatar(context, alone(index, rows[index][1]), camera), f"{names[index]} {rows[index][1]:g}")
+        for index in shown
+    ]
+    if shown:
+        write_video(context.folder / "basis.mp4", _basis_film(context, camera, shown, alone), _FPS)
+    seen = sum(row[2] >= 0.5 * row[1] for row in rows if row[1] > 0)
+    columns = ("name", "value", "largest_in_training", "picture_change", "mesh_moves_mm")
+    heading = (
+        "Expression",
+        "Drawn at",
+        "Largest in training",
+        "Change of the picture, of 255",
+        "Mesh moves at most, mm",
+    )
+    base = "added to the person at rest" if added else "alone"
+    caption = f"The 12 expressions that training reached farthest, each {base}: the mesh, and the avatar."
+    told = "The same expressions, one after the other, from nothing to their value and back."
+    return Result(
+        {"neutral_added": bool(added), "seen": seen, "rows": [dict(zip(columns, row, strict=True)) for row in rows]},
+        [
+            f"Training reached at least half of the drawn value in {seen} of {len(rows)} expressions; the others are "
+            "extrapolated."
+        ],
+        [Table(heading, [rows[index] for index in order])],
+        pictures=[Picture("basis", picture_grid(pairs, 3), caption)] if shown else [],
+        films=[Film("basis.mp4", told)] if shown else [],
+        notes=[
+            "Each expression is drawn at 1, or at the bound of the face model if that is smaller. The other "
+            + ("coefficients are those of the person at rest." if added else "coefficients are 0."),
+            f"Features of this run change along {avatar.directions.shape[1]} directions of "
+            f"{avatar.directions.shape[0]} inputs (--method.directions). "
+            "What expressions have in common along them looks alike.",
+        ],
+    )
+
+
+def _basis_film(
+    context: Context, camera: Camera, shown: list[int], alone: Callable[[int, float], FaceParams]
+) -> Iterator[np.ndarray]:
+    model = context.avatar.face_model
+    for index in shown:
+        for frame in range(16):
+            value = min(1.0, float(model.expression_bounds[index, 1])) * math.sin(math.pi * frame / 16) ** 2
+            picture = _mesh_and_avatar(context, alone(index, value), camera)
+            yield labeled(picture, f"{model.expression_names[index]} {value:.2f}")
+
+
+def start_of_bases(subject: FaceParams, model: FaceModel) -> tuple[FaceParams, int]:
+    """The face to which single expressions are added, and 1 if it is the person at rest, or 0 if all expressions are 0.
+
+    Coefficients that can be negative have no meaning of their own, and the person at rest is far from 0 in them. The
+    supplement adds those of a neutral frame then.
+    """
+    if bool((model.expression_bounds[:, 0] < 0).any()):
+        return subject, 1
+    return replace(subject, expression=torch.zeros_like(subject.expression)), 0
+
+
+def layers(context: Context) -> Result:
+    """The avatar at rest, and its mouth, without the nearest Gaussians: Fig. 2."""
+    avatar, model, subject = context.avatar, context.avatar.face_model, context.avatar.subject
+    with torch.no_grad():
+        gaussians = avatar.pose(subject).gaussians.timestep(0)
+    views = {
+        "head": head_camera(model, subject, context.camera, SIDE),
+        "mouth": mouth_camera(model, subject, context.camera, SIDE),
+    }
+    orders = {name: near_to_far(gaussians, camera) for name, camera in views.items()}
+
+    def without(name: str, share: float) -> np.ndarray:
+        return draw_avatar(avatar, subject, views[name], without_nearest(len(gaussians), orders[name], share))
+
+    def film() -> Iterator[np.ndarray]:
+        for frame in range(75):
+            share = 0.5 * frame / 74
+            yield labeled(side_by_side([without(name, share) for name in views]), f"without {100 * share:.0f} %")
+
+    pictures, values = [], {"gaussians": len(gaussians), "faint": int((gaussians.opacities < _FAINT).sum())}
+    for name, order in orders.items():
+        values[f"in_{name}"] = len(order)
+        shares = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+        drawn = [labeled(without(name, share), f"without {100 * share:.0f} %") for share in shares]
+        caption = f"The {name} of the person at rest, without the nearest Gaussians among the {len(order):,} in view."
+        pictures.append(Picture(f"layers-{name}", side_by_side(drawn), caption))
+    write_video(context.folder / "layers.mp4", film(), _FPS)
+    return Result(
+        values,
+        [
+            f"{100 * values['faint'] / max(len(gaussians), 1):.0f} % of the {len(gaussians):,} Gaussians are not drawn "
+            "in this expression, because they are fainter than 1/255."
+        ],
+        pictures=pictures,
+        films=[Film("layers.mp4", "Head and mouth, while up to half of the Gaussians in view are removed.")],
+        notes=[
+            "The supplement finds teeth behind closed lips. Look whether they appear here too: that needs frames with "
+            "visible teeth.",
+            "Only Gaussians that are drawn and whose centre is in the picture count. White shows through where no "
+            "Gaussian is behind, because no frame shows what is there.",
+        ],
+    )
+
+
+def near_to_far(gaussians: Gaussians, camera: Camera) -> Int[Tensor, " p"]:
+    """Indices of the Gaussians that a camera draws and whose centre it sees, nearest first."""
+    pixels, depth = camera.project(world_means(gaussians))
+    size = pixels.new_tensor([camera.width, camera.height])
+    seen = ((pixels >= 0) & (pixels < size)).all(-1) & (depth > 0) & (gaussians.opacities >= _FAINT)
+    indices = seen.nonzero()[:, 0]
+    return indices[depth[indices].argsort(stable=True)]
+
+
+def without_nearest(count: int, order: Int[Tensor, " p"], share: float) -> Bool[Tensor, " n"]:
+    """All of `count` Gaussians but the first of `order`, of which `share` is left out."""
+    kept = torch.ones(count, dtype=torch.bool)
+    kept[order[: round(share * len(order))]] = False
+    return kept
+
+
+def beyond(context: Context) -> Result:
+    """The avatar with one expression beyond its training maximum, and from views beyond those of training: Fig. 3."""
+    trained = trained_range(context)
+    index, yaws = strongest_expression(context, trained), shown_yaws(trained)
+    name, most = context.avatar.face_model.expression_names[index], float(trained.highest[index])
+    shown = {factor: _expressed(context, index, factor * most) for factor in (0.0, 0.5, 1.0, 1.1, 1.2, 1.3, _REACH)}
+    grid = [labeled(picture, f"{factor:g} x largest") for factor, (picture, _) in shown.items()]
+    grid += [labeled(mesh, "") for _, mesh in shown.values()]
+    views = [labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees") for yaw in yaws]
+    write_video(context.folder / "beyond-expression.mp4", _expression_film(context, index, most), _FPS)
+    write_video(context.folder / "beyond-view.mp4", _view_film(context, trained), _FPS)
+    factors, changes = _changes(context, index, most)
+    inside, outside = (float(changes[part].mean()) for part in (factors <= 1.001, factors > 1.001))
+    low, high = (math.degrees(yaw) for yaw in trained.yaws)
+    axes = Axes("times the largest training value", "mean change, of 255", from_zero=True, shaded=((1.0, _REACH),))
+    return Result(
+        {
+            "expression": name,
+            "largest_in_training": round(most, 4),
+            "factors": factors.round(2).tolist(),
+            "picture_change": changes.round(4).tolist(),
+            "training_yaw_degrees": [round(low, 1), round(high, 1)],
+            "shown_yaw_degrees": [round(math.degrees(yaw), 1) for yaw in yaws],
+        },
+        [
+            f"From 1 to {_REACH:g} times the largest training value of {name}, a tenth more changes the picture by "
+            f"{outside:.2f} of 255 on average, and {inside:.2f} below. The supplement sees colours deteriorate from "
+            "1.2 times on.",
+            f"Training saw the head from {low:.0f} to {high:.0f} degrees (yaw, positive to the subject's left). "
+            "Pictures go 30 degrees farther on both sides.",
+        ],
+        charts=[
+            Chart(
+                "beyond-change",
+                f"Change of the picture by a tenth more of {name}",
+                [Series("this run", factors, changes)],
+                axes,
+                "Shaded: what training did not see.",
+            )
+        ],
+        pictures=[
+            Picture("beyond-expression", picture_grid(grid, len(shown)), f"{name}, and the mesh below."),
+            Picture("beyond-view", side_by_side(views), "The person at rest; the outer two on each side are unseen."),
+        ],
+        films=[
+            Film("beyond-expression.mp4", f"{name} from 0 to {_REACH:g} times its largest training value."),
+            Film("beyond-view.mp4", "The camera from one side to the other, beyond the training views on both."),
+        ],
+        notes=["`mien render --set` refuses such values for users; this part poses the avatar itself."],
+    )
+
+
+def _expressed(context: Context, index: int, value: float) -> tuple[np.ndarray, np.ndarray]:
+    """The avatar at rest but for one expression, and the mesh."""
+    avatar, model = context.avatar, context.avatar.face_model
+    camera = head_camera(model, avatar.subject, context.camera, SIDE)
+    face = with_expression(avatar.subject, index, value)
+    return draw_avatar(avatar, face, camera), draw_mesh(model, face, camera)
+
+
+def _changes(context: Context, index: int, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Factors, and the mean change of the picture from a tenth less to each of them, of 255."""
+    factors = np.arange(0, round(10 * _REACH) + 1) / 10
+    drawn = [_expressed(context, index, factor * most)[0].astype(np.float32) for factor in factors]
+    return factors[1:], np.array([float(np.abs(second - first).mean()) for first, second in pairwise(drawn)])
+
+
+def _seen_from(context: Context, trained: Trained, yaw: float) -> np.ndarray:
+    return draw_avatar(context.avatar, context.avatar.subject, view_from(context, trained, yaw))
+
+
+def _expression_film(context: Context, index: int, most: float) -> Iterator[np.ndarray]:
+    for frame in range(60):
+        factor = _REACH * frame / 59
+        yield labeled(side_by_side(_expressed(context, index, factor * most)), f"{factor:.2f} x largest")
+
+
+def _view_film(context: Context, trained: Trained) -> Iterator[np.ndarray]:
+    first, *_, last = shown_yaws(trained)
+    for frame in range(60):
+        yaw = first + (last - first) * frame / 59
+        told = "seen" if trained.yaws[0] <= yaw <= trained.yaws[1] else "unseen"
+        yield labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees, {told}")
+
+
+def strongest_expression(context: Context, trained: Trained) -> int:
+    """The expression that moves the mesh most at its largest training value."""
+    basis = context.avatar.face_model.expression_basis
+    return int((trained.highest.clamp_min(0) * basis.flatten(1).norm(dim=-1)).argmax())
+
+
+def shown_yaws(trained: Trained) -> list[float]:
+    """Yaws of the pictures in radians: 30 and 15 degrees beyond the training views, at their ends, in the middle."""
+    (low, high), far, farther = trained.yaws, math.radians(15.0), math.radians(30.0)
+    return [low - farther, low - far, low, 0.5 * (low + high), high, high + far, high + farther]
+
+
+def view_from(context: Context, trained: Trained, yaw: float) -> Camera:
+    """The camera, moved around the person at rest until the head sees it at this yaw, in radians."""
+    subject = context.avatar.subject
+    camera = head_camera(context.avatar.face_model, subject, context.camera, SIDE)
+    return turned_camera(camera, subject.head_translation[0], yaw - trained.yaw_at_rest, 0.0)
+
+
+def sizes(context: Context) -> Result:
+    """Milliseconds of a frame with a changed expression, at all threads, against the size of the picture: Fig. 4."""
+    face, machine, seconds = busy_face(context), format_machine(measure_machine()), context.options.seconds
+    rows: list[dict[str, Any]] = []
+    for side in track_progress(list(SIZES), "sizes", len(SIZES)):
+        row = measure_drawing(context.avatar, context.camera.fitted(side, side), seconds, face)
+        rows.append({**row, "frame_ms": round(row["draw_ms"] + row["pose_ms"], 3), "paper_ms": SIZES[side]})
+    cells = [
+        (
+            f"{row['width']}x{row['height']}", round(row["frame_ms"], 1), row["paper_ms"], round(row["pose_ms"], 1),
+            round(row["draw_ms"], 1), row["pictures"],
+        )
+        for row in rows
+    ]  # fmt: skip
+    heading = ("Width x height", "Frame, ms", "Paper, ms", "Features and network, ms", "Drawing, ms", "Pictures timed")
+    count, threads = len(context.avatar.gaussian_store()), rows[0]["threads"]
+    names = ("width", "frame_ms", "paper_ms")
+    sides, ours, paper = (np.array([row[name] for row in rows], np.float64) for name in names)
+    slower = rows[-1]["frame_ms"] / max(rows[0]["frame_ms"], 1e-6)
+    pixels = (max(SIZES) // min(SIZES)) ** 2
+    series = [
+        Series("this run, on a CPU", sides, ours / max(ours[0], 1e-6)),
+        Series("paper, on a GPU", sides, paper / paper[0], "second"),
+    ]
+    axes = Axes("side of the picture, pixels", "times the smallest", from_zero=True)
+    return Result(
+        {"machine": machine, "gaussians": count, "threads": threads, "rows": rows, "slower": round(slower, 3)},
+        [
+            f"{count:,} Gaussians, {counted(threads, 'thread')} of a CPU: {rows[0]['frame_ms']:.1f} ms at "
+            f"{min(SIZES)}x{min(SIZES)}. With {pixels} times the pixels, a frame takes {slower:.1f} times as long "
+            f"(paper, on a GPU: {paper[-1] / paper[0]:.1f} times)."
+        ],
+        [Table(heading, cells, machine)],
+        [Chart("sizes", "Fig. 4: time of a frame, relative to the smallest picture", series, axes)],
+        notes=[
+            "A frame is posed at an expression in which no coefficient is 0, and drawn from the camera of training, "
+            f"fitted into the picture, over white. Times are medians; each row took about {seconds:g} s."
+        ],
+    )
+
+
+def ablations(context: Context) -> Result:
+    """The same short training for each variant of Table 1: Gaussians, time of a frame, scores of held-out frames."""
+    config = context.avatar.config
+    assert isinstance(config, HeadGasConfig)
+    configs = ablation_configs(config)
+    context.say_how_long("ablations", len(configs))
+    runs = {name: context.train(f"ablation-{name.replace('_', '-')}", one) for name, one in configs.items()}
+    metric, notes = perceptual_metric()
+    camera, face = context.camera.fitted(TIMED_SIDE, TIMED_SIDE), busy_face(context)
+    rows: list[dict[str, Any]] = []
+    for name, run in runs.items():
+        drawn = measure_drawing(run.avatar, camera, context.options.seconds, face)
+        row = {"gaussians": run.summary["gaussians"], "frame_ms": round(drawn["draw_ms"] + drawn["pose_ms"], 2)}
+        rows.append({"name": name, **row, **held_out_scores(run, metric)})
+    if "no_perceptual" not in configs:
+        notes.append(
+            "This run has no perceptual loss, so there is no row without it; train the run with "
+            "--method.photometric.perceptual.weight above 0 to compare."
+        )
+    cells = []
+    for row in rows:
+        label, *paper = ABLATIONS[row["name"]]
+        cells.append((label, row["gaussians"], round(row["frame_ms"], 1), *score_cells(row), *paper))
+    heading = (
+        "", "Gaussians", "Frame, ms", "PSNR, dB", "SSIM", "ST-LPIPS", "Paper: Gaussians", "Paper: frame, ms",
+        "Paper: PSNR, dB",
+    )  # fmt: skip
+    return Result(
+        {"steps": context.options.steps, "rows": rows},
+        ablation_findings(config, context.options.steps, rows),
+        [Table(heading, cells, "Scores are those of the head crop, means over held-out frames.")],
+        pictures=_ablation_picture(runs),
+        notes=[
+            f"All trainings have the same data, settings, seed and {context.options.steps:,} steps, which shorten all "
+            "schedules alike. The paper trains 50,000.",
+            f"A frame is posed at an expression in which no coefficient is 0 and drawn at {TIMED_SIDE}x{TIMED_SIDE}, "
+            "at all threads, one variant after the other.",
+            *notes,
+        ],
+    )
+
+
+def ablation_configs(config: HeadGasConfig) -> dict[str, HeadGasConfig]:
+    """The settings of each row, in the paper's order. Without the perceptual loss only if the run has one."""
+    configs = {name: replace(config, variant=name) for name in get_args(Variant)}
+    perceptual = config.photometric.perceptual
+    if perceptual.weight > 0:
+        without = replace(config.photometric, perceptual=replace(perceptual, weight=0.0))
+        configs["no_perceptual"] = replace(config, variant="full", photometric=without)
+    return {name: configs[name] for name in ABLATIONS if name in configs}
+
+
+def ablation_findings(config: HeadGasConfig, steps: int, rows: list[dict[str, Any]]) -> list[str]:
+    """What the rows say about the paper's claims: the full method has the fewest Gaussians and the best PSNR."""
+    counts, limit = [row["gaussians"] for row in rows], config.density.max_gaussians
+    if len(set(counts)) == 1:
+        findings = [f"All variants have {counts[0]:,} Gaussians; in the paper, the full method has the fewest."]
+    else:
+        few = min(rows, key=lambda row: row["gaussians"])
+        findings = [
+            f"After {steps:,} steps, {ABLATIONS[few['name']][0]} has the fewest Gaussians "
+            f"({few['gaussians']:,}); in the paper it is the full method."
+        ]
+    if max(counts) >= limit:
+        findings.append(
+            f"The limit of {limit:,} Gaussians was reached, so counts say little; "
+            "analyze a run with a larger --method.density.max-gaussians to compare them."
+        )
+    scored = {row["name"]: row["head_psnr"] for row in rows if row["head_psnr"] is not None}
+    if scored:
+        best = max(scored, key=scored.__getitem__)
+        findings.append(
+            f"{ABLATIONS[best][0].capitalize()} has the best PSNR of the head crop: {scored[best]:.2f} dB, "
+            f"against {scored['full']:.2f} dB of the full method, which is the best one in the paper."
+        )
+    return findings
+
+
+def _ablation_picture(runs: dict[str, Run]) -> list[Picture]:
+    """The held-out frame with the strongest expression: the truth, then each variant."""
+    first = runs["full"].experiment
+    if first is None:
+        return []
+    rest = first.avatar.subject.expression
+    frame = max(first.held_out_frames, key=lambda frame: float((first.face(frame).expression - rest).norm()))
+    tiles = [labeled(head_picture(first, frame, target_image(first, frame)), "truth")]
+    for name, run in runs.items():
+        assert run.experiment is not None
+        tiles.append(labeled(head_picture(run.experiment, frame, avatar_image(run.experiment, frame)), name))
+    sequence = first.sequences[frame.sequence].name
+    caption = f"{sequence}, timestep {frame.timestep}, held out: the truth, and each variant."
+    return [Picture("ablations", side_by_side(tiles), caption)]
