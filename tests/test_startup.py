@@ -55,7 +55,7 @@ capture gone.mp4 --out w; capture a.mp4 --out w --capture.size 3; capture a.mp4 
 create gone.mp4 --out w; create a.mp4 --out w --steps -3; create a.mp4 --out w --method nerf;
 create a.mp4 --out w --method.sh-degree 9; create a.mp4 --out w --config gone.json; create a.mp4 --out a.csv;
 track gone; track .; train gone; train w --hold-out nobody; evaluate; evaluate w --run nobody; evaluate w w;
-evaluate --images gone --truth gone; evaluate w --perceptual-frames -1; analyze gaussian-avatars gone;
+evaluate images gone gone; evaluate w --perceptual-frames -1; analyze gaussian-avatars gone;
 analyze gaussian-avatars w --run nobody; analyze gaussian-avatars w --parts hair; import gone --out n;
 import w --out n --dataset nobody; render gone --out a.png; render w --out a.gif; render w --out b.png --size 9999;
 render w --out b.png --background pinkish; render w --out b.mp4 --sequence nobody; drive gone --by a.csv --out b.mp4;

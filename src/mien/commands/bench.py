@@ -1,4 +1,4 @@
-"""`mien bench`: benchmarks."""
+"""Measure this machine and this version of mien."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.commands.parsing.options import PresetName, check_method, listed_methods
+from mien.commands.train_options import PresetName, check_method, listed_methods
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking.registry import STEP_BENCHMARKS
@@ -234,26 +234,7 @@ class Compare:
         run_compare_stage(self.out, opened, self.captures, settings, as_json=self.as_json)
 
 
-@dataclass(frozen=True)
-class Command:
-    """Measure this machine and this version of mien: `mien bench render | train-step | scaling | quality | compare`."""
-
-    what: Annotated[
-        Annotated[Render, tyro.conf.subcommand("render", prefix_name=False)]
-        | Annotated[TrainStep, tyro.conf.subcommand("train-step", prefix_name=False)]
-        | Annotated[Scaling, tyro.conf.subcommand("scaling", prefix_name=False)]
-        | Annotated[Quality, tyro.conf.subcommand("quality", prefix_name=False)]
-        | Annotated[Compare, tyro.conf.subcommand("compare", prefix_name=False)],
-        tyro.conf.arg(name=""),
-    ]
-
-    def check(self) -> None:
-        """Check the options of the chosen benchmark."""
-        self.what.check()
-
-    def run(self) -> None:
-        """Run the chosen benchmark."""
-        self.what.run()
+TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
 def _check_seconds(seconds: float) -> None:

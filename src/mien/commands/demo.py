@@ -1,10 +1,10 @@
 """`mien demo`: the whole path on a synthetic head."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mien.commands.create import Command as Create
-from mien.commands.parsing.options import PresetName, TrainOptions
+from mien.commands.train_options import PresetName, TrainOptions
 from mien.errors import UserError
 
 _MAX_SECONDS = 600.0
@@ -30,15 +30,13 @@ class Command:
         """Check the options without heavy libraries."""
         from mien.disk.files import check_writable
 
-        TrainOptions(preset=self.preset, steps=self.steps).settings()
+        self._options().settings()
         if self.seconds and not 0 < self.seconds <= _MAX_SECONDS:
             raise UserError(f"--seconds {self.seconds:g}: give a number above 0, at most {_MAX_SECONDS:g}")
         check_writable(self.out, folder=True)
 
     def run(self) -> None:
         """Write the video unless it exists, then run `mien create` on it."""
-        from dataclasses import replace
-
         from mien.disk.locks import hold
         from mien.lab.synthetic.captures import write_synthetic_video
         from mien.lab.synthetic.recipe import RECIPES
@@ -50,7 +48,10 @@ class Command:
         if not video.is_file():
             with hold(video):
                 write_synthetic_video(recipe, video, self.seed)
-        options = TrainOptions(preset=self.preset, steps=self.steps)
-        create = Create(videos=(video,), out=self.out, name=("synthetic",), options=options)
+        create = Create(videos=(video,), out=self.out, name=("synthetic",), options=self._options())
         create.check()
         create.run()
+
+    def _options(self) -> TrainOptions:
+        options = TrainOptions.of(preset=self.preset)
+        return replace(options, steps=self.steps) if self.steps else options

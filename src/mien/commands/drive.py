@@ -7,11 +7,11 @@ from typing import Annotated
 import tyro
 
 from mien.capture.settings import CaptureSettings
-from mien.commands.parsing.options import check_avatar, check_port, check_viewer, has_viewer
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
 from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.names import check_avatar, check_port, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from mien.commands.parsing.options import check_avatar
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
+from mien.pipeline.names import check_avatar
 from mien.pipeline.picture_options import PictureOptions
 
 if TYPE_CHECKING:
