@@ -23,7 +23,7 @@ from mien.cli import COMMANDS
 PARTS = ("given", "pictures", "videos", "flame", "gaussian_avatars", "flame_avatars", "head.mien", "head.ply", "cache")
 _BASES = (
     "render {W} --out {root}/o.png --width 16 --height 16", "render {W} --out {root}/o.png --size 16 --path captured",
-    "render {W} --out {root}/o.png --size 16 --sequence clip", "export {W} --out {root}/o.ply",
+    "render {W} --out {root}/o.png --size 16 --motion clip", "export {W} --out {root}/o.ply",
     "render {W} --out {root}/o_%03d.png --size 16 --frames 2", "export {W} --out {root}/o.mien",
     "drive {W} --by {W} --out {root}/o.mp4 --size 16", "export {W} --out {root}/o.ply --series clip",
     "export {W} --out {root}/o --format gaussian-avatars",
@@ -31,7 +31,7 @@ _BASES = (
     "train {W} --steps 1 --run other", "train {W} --steps 1 --run toy", "track {W} --again", "track {W}",
     "track {W} --hold-out clip", "face-models --json", "analyze gaussian-avatars {W} --parts growth",
     "render {W} --out {root}/o.webm --size 16 --frames 2 --background transparent",
-    "render {W} --cameras {root}/given/cameras.json --out {root}/o_%d.png",
+    "render {W} --path {root}/given/cameras.json --out {root}/o_%d.png",
     "drive {W} --by {root}/given/take.csv --out {root}/o.mp4 --size 16",
     "drive {W} --by {root}/given/take.json --out {root}/o.mp4 --size 16",
     "evaluate images {root}/pictures {root}/pictures --no-perceptual",

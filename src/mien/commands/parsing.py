@@ -19,8 +19,13 @@ from mien.errors import UserError
 from mien.machine.terminal import show
 
 _STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
-_FIRST = {"create": ("out", "name", "preset", "method", "device", "view")}
-"""Commands for newcomers: the only options that `--help` shows of them. `--help-all` shows all."""
+_FIRST = {
+    "create": ("out", "name", "preset", "method", "device", "view"),
+    "render": ("out", "run", "set", "path", "motion", "yaw", "size", "background"),
+    "drive": ("by", "out", "run", "neutral", "alone", "size"),
+    "batch": ("out", "on", "retry", "jobs", "shard"),
+}
+"""Commands with many options: the only ones that `--help` shows of them. `--help-all` shows all."""
 _COMMON = {
     "capture": ("size", "crop", "start", "end", "turn", "stride", "fps", "cuts", "clean-plate", "mattes"),
     "tracking": ("focal", "same-camera", "schedule"),
@@ -153,7 +158,7 @@ def explained(
             defaults[one.name] = value
     # It is a subclass, because tyro finds descriptions of groups in the parent.
     inside = {"__annotations__": annotations, "__doc__": kind.__doc__, "__module__": kind.__module__, **defaults}
-    return dataclass(frozen=True)(type(kind.__name__, (kind,), inside))
+    return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), inside))
 
 
 def _about_value(is_silent: bool, allowed: Range | None, value: Any, others: Mapping[str, Any], default: str) -> str:

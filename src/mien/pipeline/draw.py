@@ -20,6 +20,7 @@ from mien.render import rasterize
 from mien.render.closing import close_holes
 from mien.render.validation import drawable
 from mien.runtime.camera_paths import zoom_for_all
+from mien.training.footage.filmed import filmed_words, read_coverage
 from mien.training.run import read_run_config
 from mien.training.whole_head.soft_cut import shares_left
 
@@ -86,6 +87,14 @@ def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> Non
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
             "`mien train --background random` avoids that"
         )
+
+
+def tell_of_sides(run_dir: Path, avatar: Avatar) -> None:
+    """Say how far to each side the head was filmed, if that is known. Beyond, it is completed."""
+    covered = read_coverage(run_dir, avatar.face_model)
+    if covered is not None:
+        neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach()
+        say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
 
 
 def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
