@@ -69,8 +69,11 @@ def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> No
 def complaint_of(line: str) -> str:
     """What is wrong with a command line. A part of one, inline, lacks what must be given."""
     whole = line.startswith("mien ")
-    name, *words = shlex.split(line.removeprefix("`").removesuffix("`").removeprefix("mien "), comments=True)
-    if "..." in line or {"|", "NAME", "METHOD", "[--run"} & {*words} or name not in COMMANDS or not words:
+    name, _, typed = line.strip("`").removeprefix("mien ").partition(" ")
+    if "..." in line or name not in COMMANDS:
+        return ""
+    words = shlex.split(typed, comments=True)
+    if {"|", "NAME", "METHOD", "[--run"} & {*words} or not words:
         return ""
     try:
         parse(importlib.import_module(f"mien.commands.{name.replace('-', '_')}"), name, words)
