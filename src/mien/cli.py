@@ -152,7 +152,8 @@ def _run(name: str, arguments: list[str]) -> int:
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     command = parse(importlib.import_module("mien.commands." + name.replace("-", "_")), name, arguments)
     asked_threads()
-    command.check()
+    if hasattr(command, "check"):
+        command.check()
     with orderly_stops():
         use_one_torch_thread()
         _check_instruction_set()

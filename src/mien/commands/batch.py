@@ -161,9 +161,6 @@ class Status:
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print json on standard output, for programs."""
 
-    def check(self) -> None:
-        """Check nothing: the plan is read at once."""
-
     def run(self) -> None:
         """Show the status."""
         from mien.batch.progress import batch_progress, progress_text
@@ -188,9 +185,6 @@ class Table:
     """Columns of the results whose means are shown, separated by commas."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print json on standard output, for programs."""
-
-    def check(self) -> None:
-        """Check nothing: the plan is read at once."""
 
     def run(self) -> None:
         """Print and write the table."""

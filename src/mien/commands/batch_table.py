@@ -76,10 +76,10 @@ def read_table(path: Path, for_all: Sequence[str] = ()) -> list[Row]:
         path: A csv, a json, or a folder of videos.
         for_all: Options of `mien create` for all rows, as they were typed. A cell of the table goes first.
     """
+    usual, kinds = _columns_of(for_all), set[str]()
     entries = list(_entries(path))
     if not entries:
         raise UserError(f"{path}: has no rows; give a table of captures, or a folder of videos")
-    usual, kinds = _columns_of(for_all), set[str]()
     place = path.parent if path.is_file() else path
     rows = [_row(place, entry, f"{path}, row {number}", kinds, usual) for number, entry in enumerate(entries, 1)]
     _check_twice([row.name for row in rows], str(path), "two rows have the name {!r}; give each row its own")
@@ -93,6 +93,8 @@ def _columns_of(words: Sequence[str]) -> dict[str, list[str]]:
         name, equals, value = word.partition("=")
         if word.startswith("--"):
             column = _NO.sub(r"\1", _column(name))
+            if column in columns:
+                raise UserError(f"--{column} is given twice; give it once, followed by all of its values")
             columns[column] = [value] if equals else ["no"] if column != _column(name) else []
         elif not columns:
             raise UserError(f"unknown: {word}; give one table of captures, or one folder of videos")

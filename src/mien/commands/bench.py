@@ -2,10 +2,10 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -37,20 +37,29 @@ _MOST_MINUTES = 100_000
 
 
 @dataclass(frozen=True)
-class Render:
-    """Measure how fast the native core draws Gaussians, forward and backward, by size, threads and instruction set."""
-
+class _Timed:
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
     seconds: float = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
+
+    def check(self) -> None:
+        """Check that there is time to measure."""
+        if not 0 < self.seconds < math.inf:
+            raise UserError(f"--seconds {self.seconds:g}: give a positive number; each row is measured for that long")
+
+
+@dataclass(frozen=True)
+class Render(_Timed):
+    """Measure how fast the native core draws Gaussians, forward and backward, by size, threads and instruction set."""
+
     device: DeviceName = "cpu"
     """Device to draw on. cuda measures gsplat on a GPU, at the sizes of the papers."""
 
     def check(self) -> None:
         """Check that CUDA has gsplat and that there is time to measure."""
+        super().check()
         check_device(self.device)
-        _check_seconds(self.seconds)
 
     def run(self) -> None:
         """Measure and print the rows."""
@@ -66,13 +75,9 @@ class Render:
 
 
 @dataclass(frozen=True)
-class Scaling:
+class Scaling(_Timed):
     """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
 
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and all rows as json, for programs."""
-    seconds: float = 0.8
-    """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     plot: Path | None = None
     """File for a chart: .png, .svg or .pdf (default: no chart)."""
 
@@ -80,7 +85,7 @@ class Scaling:
         """Check before any measurement that the chart can be written and that there is time to measure."""
         from mien.lab.benchmarking.chart_path import check_chart_path
 
-        _check_seconds(self.seconds)
+        super().check()
         if self.plot is not None:
             check_chart_path(self.plot)
 
@@ -95,7 +100,7 @@ class Scaling:
 
 
 @dataclass(frozen=True)
-class TrainStep:
+class TrainStep(_Timed):
     """Measure a training step (no footage is needed), and posing together with drawing."""
 
     method: StepMethod = DEFAULT_METHOD
@@ -105,8 +110,6 @@ class TrainStep:
     """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
     A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
     fastest round."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and all rows as json, for programs."""
     seconds: float = 3.0
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
@@ -114,8 +117,8 @@ class TrainStep:
 
     def check(self) -> None:
         """Check that CUDA has gsplat and that there is time to measure."""
+        super().check()
         check_device(self.device)
-        _check_seconds(self.seconds)
         if STEP_BENCHMARKS[self.method].on_gpu is None and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
         if self.parts and self.method != DEFAULT_METHOD:
@@ -126,7 +129,9 @@ class TrainStep:
     def run(self) -> None:
         """Measure and print the rows."""
         if self.parts:
-            _show_parts(self.seconds, self.as_json)
+            from mien.lab.benchmarking.step_parts import format_parts, parts_suite
+
+            show_rows(parts_suite(self.seconds), self.as_json, as_text=format_parts)
             return
         benchmark = STEP_BENCHMARKS[self.method]
         like = None if benchmark.on_gpu is None else _gpu(self.device)
@@ -237,38 +242,16 @@ class Compare:
 TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
-def _check_seconds(seconds: float) -> None:
-    if not 0 < seconds < math.inf:
-        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for that long")
-
-
-def _show_parts(seconds: float, as_json: bool) -> None:
-    """Print the machine and the parts of a training step, for one thread and for all, or everything as json."""
-    import torch
-
-    from mien.lab.benchmarking.step_parts import format_parts, parts_suite
-    from mien.lab.benchmarking.timing import format_machine, measure_machine
-
-    torch.set_num_threads(1)
-    machine, shown = measure_machine(), []
-    if not as_json:
-        show(format_machine(machine))
-    for rows in parts_suite(seconds):
-        shown += rows
-        if not as_json:
-            show(format_parts(rows))
-    if as_json:
-        show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
-
-
 def _gpu(name: DeviceName) -> "torch.Tensor | None":
     """A scalar on the chosen GPU, or None for the CPU."""
     device = choose_device(name)
     return like_on(device) if device.type == "cuda" else None
 
 
-def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) -> "tuple[Machine, list[BenchmarkRow]]":
-    """Print the machine, and each row once it is measured, or everything as json. Torch uses one thread."""
+def show_rows(
+    rows: "Iterable[Any]", as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
+) -> "tuple[Machine, list[BenchmarkRow]]":
+    """Print the machine, and each row (or list of rows) once it is measured, or everything as json, with one thread."""
     import torch
 
     from mien.lab.benchmarking.timing import format_machine, format_row, measure_machine
@@ -278,9 +261,9 @@ def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) 
     if not as_json:
         show(format_machine(machine))
     for row in rows:
-        shown.append(row)
+        shown += row if isinstance(row, list) else [row]
         if not as_json:
-            show(format_row(row))
+            show((as_text or format_row)(row))
     if as_json:
         show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
     return machine, shown

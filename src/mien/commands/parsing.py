@@ -57,17 +57,20 @@ def parse(module: ModuleType, name: str, arguments: Sequence[str]) -> Any:
 
 def parse_options(command: type, prog: str, arguments: Sequence[str]) -> Any:
     """The options of a command. Their defaults are those of the preset and the file that the arguments name."""
-    names = [argument.partition("=")[0] for argument in arguments if argument.startswith("--")]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise UserError(f"{twice} is given twice; give it once, followed by all of its values")
+    default, names = with_defaults(command, arguments), [argument.partition("=")[0] for argument in arguments]
+    parts = [default, *(part for part in vars(default).values() if isinstance(part, TrainOptions))]
+    for name in (name for part in parts for name, value in vars(part).items() if isinstance(value, tuple)):
+        if names.count(option := f"--{name.replace('_', '-')}") > 1:
+            # The first of its values would be dropped without a word.
+            raise UserError(f"{option} is given twice; give it once, followed by all of its values")
     told, more = io.StringIO(), getattr(command, "takes_more", False)
     try:
         with contextlib.redirect_stderr(told):
             if {"-h", "--help", "--help-all"} & {*arguments}:
                 _help(command, prog, arguments)
-            found = tyro.cli(command, prog=prog, args=arguments, default=with_defaults(command, arguments),
-                             config=_STYLE, return_unknown_args=more)  # fmt: skip
+            found = tyro.cli(
+                command, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more
+            )
     except SystemExit as stop:
         if not stop.code:
             raise

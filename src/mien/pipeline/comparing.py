@@ -88,12 +88,7 @@ def run_compare_stage(
 ) -> None:
     """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
 
-    Args:
-        out: Folder for the tables, for trials, and for reference captures with their workspaces.
-        workspaces: Tracked workspaces. Their runs are called `settings.run_name(method)`.
-        captures: Names of reference captures, which are drawn, captured and tracked first.
-        settings: Methods and budget.
-        as_json: Whether the result is printed as json.
+    The captures are tracked workspaces, and reference captures, which are drawn, captured and tracked in OUT first.
     """
     references = [reference_named(name) for name in captures]
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):

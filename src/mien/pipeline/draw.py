@@ -53,11 +53,7 @@ def posed_softly(avatar: Avatar) -> Callable[[FaceParams], Gaussians]:
 def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing: int = 0) -> UInt8[np.ndarray, "h w _"]:
     """The picture as RGB over the background, or as RGBA with straight colours.
 
-    Args:
-        options: What pictures look like.
-        gaussians: What is drawn.
-        camera: The camera.
-        closing: Pixels by which holes are closed (`close_holes`). Transparent pictures keep them.
+    Holes are closed by `closing` pixels (`close_holes`), but not in transparent pictures.
     """
     background = torch.tensor(options.color()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
