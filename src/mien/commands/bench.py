@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.commands.train_options import PresetName, check_method, listed_methods
+from mien.commands.train_options import check_method, listed_methods
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking.registry import STEP_BENCHMARKS
@@ -153,8 +153,6 @@ class Quality:
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
     steps: int = 0
     """Number of optimiser steps. 0 means each capture's own number."""
-    align: bool = True
-    """Align frames of one camera before training, as `mien create` does (--no-align: train on the tracking)."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -170,7 +168,7 @@ class Quality:
         """Run every capture through all stages, then print the table."""
         from mien.pipeline.quality import run_quality_stage
 
-        run_quality_stage(self.out, self.captures, self.method, self.steps, aligned=self.align, as_json=self.as_json)
+        run_quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
 
 
 @dataclass(frozen=True)
@@ -192,8 +190,6 @@ class Compare:
     means --steps."""
     steps: int = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
-    preset: PresetName = "standard"
-    """How thorough the training is."""
     split: Literal["blocks", "tail"] = "blocks"
     """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
     captures have their own."""
@@ -205,7 +201,6 @@ class Compare:
     def check(self) -> None:
         """Check without heavy libraries that there is something to compare, and that it can be written."""
         from mien.disk.files import check_writable
-        from mien.training.settings import PRESETS
 
         if not self.workspaces and not self.captures:
             raise UserError("nothing to compare on; give workspace folders, or --captures NAME")
@@ -219,7 +214,6 @@ class Compare:
             raise UserError("--methods: give at least one method")
         for method in self.methods:
             check_method("--methods", method)
-            PRESETS[self.preset].config(method)
         roots = [folder.resolve() for folder in self.workspaces]
         names = [root.name for root in roots] + list(self.captures)
         twice = next((name for name in names if names.count(name) > 1), None)
@@ -234,7 +228,7 @@ class Compare:
         from mien.pipeline.comparing import Budget, CompareSettings, run_compare_stage
 
         methods = tuple(dict.fromkeys(self.methods))
-        settings = CompareSettings(methods, self.preset, Budget(self.minutes, self.steps), self.split)
+        settings = CompareSettings(methods, Budget(self.minutes, self.steps), self.split)
         opened = [open_workspace(folder) for folder in self.workspaces]
         run_compare_stage(self.out, opened, self.captures, settings, as_json=self.as_json)
 

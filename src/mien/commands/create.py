@@ -117,12 +117,8 @@ class Command:
     def aligns(self, several_cameras: bool) -> bool:
         """Whether new trackings are aligned."""
         auto = not several_cameras and not PRESETS[self.options.preset].published
-        auto = auto and not self._too_short_to_align(self.options.settings().steps)
+        auto = auto and self.options.steps >= self.alignment.template_steps  # else the quick avatar is no quicker
         return self.alignment.when == "always" or (self.alignment.when == "auto" and auto)
-
-    def _too_short_to_align(self, steps: int) -> bool:
-        """Whether a run is shorter than the training of the quick avatar that frames are aligned to."""
-        return steps < self.alignment.template_steps
 
     def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
         from mien.evaluation.protocols import EvaluationSettings
@@ -171,7 +167,7 @@ class Command:
         from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
 
         one = one_camera(workspace, names)
-        if one and self.alignment.when == "auto" and self._too_short_to_align(settings.steps):
+        if one and self.alignment.when == "auto" and settings.steps < self.alignment.template_steps:
             say(
                 f"frames are not aligned to a quick avatar, as --steps {settings.steps} is below its own "
                 f"{self.alignment.template_steps:,}; `--alignment.when always` aligns them"

@@ -23,8 +23,6 @@ class Command:
     """Number of optimiser steps. 0 means the preset's number."""
     seconds: float = 0.0
     """Length of the video in seconds. 0 means the default length."""
-    seed: int = 0
-    """Seed of the head and its motion. Another seed gives another head and another motion."""
 
     def check(self) -> None:
         """Check the options without heavy libraries."""
@@ -44,10 +42,10 @@ class Command:
         recipe = RECIPES["demo"]
         if self.seconds:
             recipe = replace(recipe, seconds=self.seconds)
-        video = self.out / f"synthetic-{self.seed}-{recipe.seconds:g}s.mp4"
+        video = self.out / f"synthetic-0-{recipe.seconds:g}s.mp4"
         if not video.is_file():
             with hold(video):
-                write_synthetic_video(recipe, video, self.seed)
+                write_synthetic_video(recipe, video, seed=0)
         create = Create(videos=(video,), out=self.out, name=("synthetic",), options=self._options())
         create.check()
         create.run()

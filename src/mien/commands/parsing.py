@@ -49,7 +49,7 @@ def parse(module: ModuleType, name: str, arguments: Sequence[str]) -> Any:
     if task not in tasks:
         listed = "\n".join(f"  {each:<12} {str(kind.__doc__).splitlines()[0]}" for each, kind in tasks.items())
         if not {"-h", "--help", "--help-all"} & {*rest}:
-            raise UserError(f"{prog} {' '.join(rest[:1])}: give one of {', '.join(tasks)}; see {prog} --help")
+            raise UserError(f"{' '.join([prog, *rest[:1]])}: give one of {', '.join(tasks)}; see {prog} --help")
         show(f"usage: {prog} TASK [options]\n\n{module.__doc__}\n\n{listed}")
         raise SystemExit(0)
     return parse_options(tasks[task], prog, rest)
