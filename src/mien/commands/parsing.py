@@ -41,9 +41,10 @@ def parse(module: ModuleType, name: str, arguments: Sequence[str]) -> Any:
     """The command of a module with its options, as they were typed. Help ends the program.
 
     A module has a dataclass `Command`, or `TASKS`: a dataclass for each word that may follow the name of the command.
-    The task "" is that without such a word.
+    The task "" is that without such a word. Or it has `task_of`, which picks the dataclass by the arguments.
     """
-    rest, tasks = list(arguments), getattr(module, "TASKS", None) or {"": module.Command}
+    rest, tasks = list(arguments), getattr(module, "TASKS", None)
+    tasks = tasks or {"": module.task_of(rest) if hasattr(module, "task_of") else module.Command}
     task = rest.pop(0) if rest and rest[0] in tasks else ""
     prog = f"mien {name} {task}".rstrip()
     if task not in tasks:
@@ -74,7 +75,8 @@ def parse_options(command: type, prog: str, arguments: Sequence[str]) -> Any:
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise UserError(f"{in_one_line(told.getvalue())}; see {prog} --help-all") from None
+        remedy = getattr(command, "remedy", "")
+        raise UserError(f"{in_one_line(told.getvalue())}; {remedy}see {prog} --help-all") from None
     return replace(found[0], for_all=tuple(found[1])) if more else found
 
 
