@@ -17,7 +17,7 @@ from mien.avatar.settings import Rate
 from mien.avatar.store import Moments
 from mien.cli import main
 from mien.commands.create import Command as Create
-from mien.commands.parsing.options import TrainOptions
+from mien.commands.parsing import parse_options
 from mien.driving import drive
 from mien.driving.drivers import Driver
 from mien.driving.neutral import with_neutral
@@ -246,13 +246,12 @@ def test_wrong_options_are_one_line(workspace: Path, capsys) -> None:
 
 
 @pytest.mark.parametrize(("several", "when", "options", "aligns"), [
-    (False, "auto", {}, True), (False, "auto", {"preset": "draft"}, True), (False, "auto", {"preset": "paper"}, False),
-    (False, "auto", {"steps": 100}, False), (False, "never", {}, False), (True, "auto", {}, False),
-    (True, "always", {}, True),
+    (False, "auto", [], True), (False, "auto", ["--preset", "draft"], True),
+    (False, "auto", ["--preset", "paper"], False), (False, "auto", ["--steps", "100"], False),
+    (False, "never", [], False), (True, "auto", [], False), (True, "always", [], True),
 ])  # fmt: skip
 def test_create_aligns_one_camera_and_no_paper(several, when, options, aligns) -> None:
-    settings = AlignmentSettings(when=when)
-    command = Create((Path("a.mp4"),), Path("out"), alignment=settings, options=TrainOptions(**options))
+    command = parse_options(Create, "mien create", ["a.mp4", "--out", "out", "--alignment.when", when, *options])
     assert command.aligns(several) == aligns
 
 

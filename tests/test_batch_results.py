@@ -17,7 +17,8 @@ from mien.batch.steps import write_strip
 from mien.batch.wall import write_wall
 from mien.cli import main
 from mien.commands import batch as batch_command
-from mien.commands.batch_table import for_all_rows, read_table
+from mien.commands.batch_table import read_table
+from mien.commands.parsing import parse
 from mien.errors import UserError
 from mien.media.video import write_video
 from refusals import complaint, refuses
@@ -108,9 +109,9 @@ def test_what_makes_no_sense_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
     plan = Path("OTHER/plan.json")
     plan.write_text(plan.read_text().replace('"version": 1', '"version": 99'))
     for line, told in (
-        ("status DIR --rows light", "--rows: changes nothing for `mien batch status`"),
-        ("table DIR --watch", "--watch: changes nothing for `mien batch table`"),
-        ("TABLE --out DIR --columns ssim", "--columns: changes nothing for a batch that runs on local"),
+        ("status DIR --rows light", "Unrecognized options: --rows"),
+        ("TABLE --out DIR --gpus 1", "--gpus: changes nothing for --on local"),
+        ("TABLE DIR --out OUT", "unknown: DIR"),
         ('TABLE --out DIR --program "echo \'x"', "--program echo 'x: No closing quotation"),
         ("TABLE --out DIR --store nosuch://x", "nosuch://x: cannot be reached"),
         ("status TABLE", "is not the folder of a batch"),
@@ -190,9 +191,10 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
 
 def test_options_of_create_count_for_all_rows_and_a_cell_goes_first(table: Path, tmp_path: Path):
     typed = ["people.csv", "--steps", "30", "--out", "people", "--no-face-tuning", "--capture.size=256"]
-    others, for_all = for_all_rows([*typed, "--method", "textured_mesh", "--training.resolution", "96"])
-    assert others == ["people.csv", "--out", "people"]
-    ann, bob = (row.steps[0] for row in read_table(table, for_all))
+    typed += ["--method", "textured_mesh", "--training.resolution", "96"]
+    command = parse(batch_command, "batch", typed)
+    assert (command.table, command.out) == (Path("people.csv"), Path("people"))
+    ann, bob = (row.steps[0] for row in read_table(table, command.for_all))
     more = ("--no-face-tuning", "--capture.size", "256", "--training.resolution", "96")
     made = ("--out", "{workspace}", "--method")
     assert ann == ("create", str(tmp_path / "ann.mp4"), *made, "gaussian_avatars", "--steps", "60", *more)
@@ -200,10 +202,10 @@ def test_options_of_create_count_for_all_rows_and_a_cell_goes_first(table: Path,
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    ("--preset best", "row 1: --preset: give one of 'draft', "),
+    ("--preset best", "row 1: invalid choice 'best' for argument '--preset'"),
     ("--view", "'view' cannot be set; nobody watches"),
     ("--steps 3 --steps 4", "--steps is given twice"),
-    ("--capture.sizes 3", "row 1: unknown: --capture.sizes; did you mean --capture.size"),
+    ("--capture.sizes 3", "row 1: Unrecognized options: --capture.sizes, 3; Perhaps you meant: --capture.size"),
     ("--name ann", "unknown: --name"),
 ])  # fmt: skip
 def test_wrong_options_of_all_rows_are_named(table: Path, capsys: Any, options: str, words: str):
@@ -227,9 +229,9 @@ MISTAKES = [
     ("video,stepz\nann.mp4,3", "did you mean 'steps'"), ("video\ngone.mp4", "gone.mp4: no such file"),
     (f"video\n{'x' * 300}", "x: no such file"),
     ("video,method\nann.mp4,nerf", "nerf"), ("video,steps\nann.mp4,-3", "row 1: "),
-    ("video,steps\nann.mp4,many", "row 1: --steps: give a whole number instead of 'many'; see mien create"),
-    ("video,preset\nann.mp4,best", "row 1: --preset: give one of 'draft', "),
-    ("video,capture.sizes\nann.mp4,9", "did you mean --capture.size"),
+    ("video,steps\nann.mp4,many", "row 1: Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+    ("video,preset\nann.mp4,best", "row 1: invalid choice 'best' for argument '--preset'"),
+    ("video,capture.sizes\nann.mp4,9", "Perhaps you meant: --capture.size"),
     ("video,hold_out,hold-out\nann.mp4,3,4", "columns 'hold_out' and 'hold-out' are the same"),
     ("video,out\nann.mp4,elsewhere", "column 'out' cannot be set"),
     ("video,name\nann.mp4,x\nbob.mp4,x", "two rows have the name 'x'"),

@@ -122,7 +122,7 @@ def test_what_two_trials_share_is_not_counted_for_each_step(workspace: Path, tmp
         return times[settings.steps]
 
     monkeypatch.setattr(comparing, "trial_seconds", trial)
-    chosen = CompareSettings(("gaussian_avatars",), "standard", Budget(minutes=2.0), "tail")
+    chosen = CompareSettings(("gaussian_avatars",), Budget(minutes=2.0), "tail")
     subject = comparing.of_workspace(Workspace(workspace), chosen)
     config = PRESETS["standard"].config("gaussian_avatars")
 

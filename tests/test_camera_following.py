@@ -281,10 +281,10 @@ def test_what_the_command_refuses(tmp_path: Path, capsys) -> None:
     for options, message in (
         (["--by", "camera:/dev/video99"], "there is no /dev/video99"),
         (["--by", "camera:"], "names no camera"),
-        (["--by", "camera", "--sequence", "a"], "--sequence a: is for recordings"),
+        (["--by", "camera", "--sequence", "a"], "Unrecognized options: --sequence, a; options of recordings"),
         (["--by", f"camera:{clip}", "--out", "a.webm"], "recorded as .mp4"),
         (["--by", f"camera:{clip}", "--port", "99999"], "--port 99999"),
-        (["--by", str(clip), "--camera-format", "v4l2", "--out", "a.mp4"], "--camera-format"),
+        (["--by", str(clip), "--camera-format", "v4l2", "--out", "a.mp4"], "Unrecognized options: --camera-format"),
     ):
         assert message in complaint(capsys, "drive", str(avatar), *options)
 

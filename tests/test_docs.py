@@ -4,6 +4,7 @@ import importlib
 import inspect
 import json
 import re
+import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,8 @@ import pytest
 from forked import ForkServer
 from mien.avatar.methods import METHODS
 from mien.cli import COMMANDS, main
+from mien.commands.parsing import parse
+from mien.errors import UserError
 from mien.formats.page import write_page
 from toy_package import blocks
 from web_case import browse, drawn_head, served, violations
@@ -61,6 +64,36 @@ def test_options_that_pages_name_exist(capsys: pytest.CaptureFixture[str]) -> No
     option = re.compile(r"(?<![\w-])--(?:capture|tracking|training|method)\.[a-z][\w.-]*\w")
     named = {(page.name, name) for page, text in PROSE.items() for name in option.findall(text)}
     assert sorted((page, name) for page, name in named if name not in known) == []
+
+
+def complaint_of(line: str) -> str:
+    """What is wrong with a command line. A part of one, inline, lacks what must be given."""
+    whole = line.startswith("mien ")
+    name, _, typed = line.strip("`").removeprefix("mien ").partition(" ")
+    if "..." in line or name not in COMMANDS:
+        return ""
+    words = shlex.split(typed, comments=True)
+    if {"|", "NAME", "METHOD", "[--run"} & {*words} or not words:
+        return ""
+    try:
+        parse(importlib.import_module(f"mien.commands.{name.replace('-', '_')}"), name, words)
+    except SystemExit:
+        return ""  # help
+    except UserError as error:
+        is_wrong = "Unrecognized" in str(error) or (whole and "no such file" not in str(error))
+        return f"{line}: {error}" if is_wrong else ""
+    return ""
+
+
+@pytest.mark.unchecked
+def test_command_lines_of_pages_are_those_of_the_command_line() -> None:
+    lines = set[str]()
+    for text in PROSE.values():
+        code = text.replace("\\\n", " ").replace(" && ", "\n    ")
+        lines |= set(re.findall(r"^(?: {4})?(mien [a-z][^\n]*)", code, re.MULTILINE))
+        lines |= set(re.findall(r"`mien [a-z][^`\n]*`", text))
+    assert len(lines) > 250
+    assert [told for line in sorted(lines) if (told := complaint_of(line))] == []
 
 
 API = PROSE[ROOT / "docs" / "api.md"]

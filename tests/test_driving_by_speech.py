@@ -209,8 +209,8 @@ def test_the_command_writes_a_talking_avatar(tmp_path: Path, monkeypatch, capsys
         (["--out", str(out)], 0, ""),
         (["--out", str(out.with_suffix(".webm"))], 0, "has no sound; only an .mp4"),
         (["--sequence", "a", "--out", str(out)], 2, ""),
-        (["--alone"], 2, "--alone, the options of pictures: needs --out"),
-        (["--out", str(out), "--port", "80"], 2, "--port 80: is for the viewer"),
+        (["--alone"], 2, "options of films need --out FILE.mp4"),
+        (["--out", str(out), "--port", "80"], 2, "Unrecognized options: --port"),
     ):
         assert main(["drive", str(tmp_path / "w"), "--by", str(voice), "--size", "32", *options]) == code
         assert said in capsys.readouterr().err

@@ -54,7 +54,7 @@ def test_demo_beats_both_baselines_and_leaves_what_people_look_at(demo: Path) ->
 
 def test_everybody_can_read_the_reports(demo: Path, tmp_path: Path) -> None:
     chromium()
-    assert main(["evaluate", str(demo), "--compare", "--out", str(tmp_path / "compare.html")]) == 0
+    assert main(["evaluate", "compare", str(demo), "--out", str(tmp_path / "compare.html")]) == 0
     tracked = demo / "sequences/synthetic/tracking/report.html"
     for page in (demo / RUN / "report.html", tracked, tmp_path / "compare.html"):
         for size, device in (((1280, 800), []), ((390, 844), ["dark", "touch"])):

@@ -319,13 +319,13 @@ def test_comparison_warns_of_other_frames_masks_and_missing_runs(root: Path, tmp
 
 @pytest.mark.unchecked
 def test_compare_command(scored: dict[str, dict], root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(root), "--compare", "--json"]) == 0
+    assert main(["evaluate", "compare", str(root), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["format"], printed["version"]) == ("mien.comparison", 1)
     tables = {(table["protocol"], len(table["rows"])) for table in printed["tables"]}
     assert ("novel_view", 4) in tables
     assert "http" not in (root / "compare.html").read_text()
-    assert main(["evaluate", str(root), str(root / "runs" / "none"), "--compare"]) == 2
+    assert main(["evaluate", "compare", str(root), str(root / "runs" / "none")]) == 2
 
 
 def test_closing_lines_say_what_each_figure_is_of(scored: dict[str, dict]) -> None:

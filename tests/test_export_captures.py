@@ -218,7 +218,7 @@ def test_pictures_of_others_are_scored_against_the_truth(folders: dict[str, Path
             inside, outside = (single.scoring[timestep, 0] == level for level in (255, 0))
             assert np.array_equal(picture[inside], single.capture.images[timestep, 0][inside])
             assert (picture[outside] == 255).all()
-        assert "mien evaluate --images PICTURES --truth scoring/truth" in (folders[name] / "README.txt").read_text()
+        assert "mien evaluate images PICTURES scoring/truth" in (folders[name] / "README.txt").read_text()
     truths = folders["insta"] / "scoring/truth"
     assert score_folders(ImageFolders(truths, truths))["l1"] == 0
 

@@ -244,7 +244,7 @@ def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
 @pytest.mark.parametrize("options", [["expressions"], ["filmed", "--strength", "1.5"], ["turntable", "--span", "180"]])
 def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: list[str]) -> None:
     out = tmp_path / "sheet.png"
-    assert main(["render", str(workspace), "--out", str(out), "--size", "32", "--sheet", *options]) == 0
+    assert main(["render", "sheet", str(workspace), *options, "--out", str(out), "--size", "32"]) == 0
     sheet = known(cv2.imread(str(out)))
     assert sheet.shape[1] % 36 == 32 or sheet.shape[1] == 32
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 20
@@ -252,11 +252,11 @@ def test_the_command_draws_a_sheet(workspace: Path, tmp_path: Path, options: lis
 
 def test_a_sheet_lies_in_the_runs_folder_and_what_is_beyond_the_film_is_told(workspace, tmp_path, capsys) -> None:
     """Other pictures need a name, because it says what they are."""
-    render = ["render", str(shutil.copytree(workspace, tmp_path / "W")), "--size", "32"]
-    assert main([*render, "--sheet", "turntable"]) == 0
+    copy = str(shutil.copytree(workspace, tmp_path / "W"))
+    assert main(["render", "sheet", copy, "turntable", "--size", "32"]) == 0
     (sheet,) = (tmp_path / "W/runs").glob("*/sheet_turntable.png")
     assert f"{sheet}: 9 pictures" in capsys.readouterr().err
-    assert "--out: is missing" in complaint(capsys, *render)
+    assert "Missing from mien render: --out" in complaint(capsys, "render", copy)
     still = ["render", str(workspace), "--out", str(tmp_path / "a.png"), "--size", "32"]
     for value, told in ((1, True), (0, False)):
         assert main([*still, "--set", f"drop={value}"]) == 0

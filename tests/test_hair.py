@@ -249,9 +249,7 @@ def test_hair_draws_nothing_and_offsets_that_tracking_found_are_kept(anny: FaceM
 def test_which_meshes_are_fitted(mesh, unseen, bound: bool, fits: bool) -> None:
     model, sequence = toy_sequence(timesteps=3, size=32)
     settings = TrainSettings(mesh=mesh, unseen=unseen)
-    faces = fitted_faces(
-        Footage(model, [sequence], [sequence.tracking.face], [Frame(0, 0, 0)]), settings, bound=bound
-    )
+    faces = fitted_faces(Footage(model, [sequence], [sequence.tracking.face], [Frame(0, 0, 0)]), settings, bound=bound)
     assert (faces is not None) is fits
 
 

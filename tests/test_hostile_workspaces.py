@@ -38,7 +38,7 @@ from toy_scene import toy_face_model, toy_sequence
 
 COMMANDS = (
     "render W --out OUT/a.png --size 32", "view W", "export W --out OUT/a.ply",
-    "drive W --by W --out OUT/b.mp4 --size 32", "evaluate W --no-perceptual", "evaluate W --compare",
+    "drive W --by W --out OUT/b.mp4 --size 32", "evaluate W --no-perceptual", "evaluate compare W",
     "train W --run other --steps 1", "track W", "capture OUT/clip.mp4 --out W", "create OUT/clip.mp4 --out W",
     "export W --out OUT/folder --format gaussian-avatars", "import OUT/avatar --out W",
     "analyze gaussian-avatars W --parts growth", "study make W --out OUT/a.html",

@@ -171,7 +171,7 @@ def test_frames_are_those_of_training(made: Path, tmp_path: Path) -> None:
     first, third = (read_image(tmp_path / f"{timestep}.png").astype(int) for timestep in (0, 2))
     assert first.std() > 5
     assert np.abs(first - third).max() > 20
-    film = [str(made / "I"), "--out", str(tmp_path / "film"), "--own-motion", "--path", "still", "--size", "64"]
+    film = [str(made / "I"), "--out", str(tmp_path / "film"), "--motion", "own", "--path", "still", "--size", "64"]
     assert main(["render", *film, "--zoom", "1"]) == 0
     frames = sorted((tmp_path / "film").iterdir())
     assert len(frames) == 5
@@ -200,7 +200,6 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
         (("import", str(made / "F"), *into, "--face-model", "gone"), "no face model 'gone'"),
         (("import", str(tmp_path / "D"), *into), "binding_0 of Gaussian"),
         (("render", imported, "--out", f"{out}.png", "--timestep", "5"), "has the timesteps 0 to 4"),
-        (("render", imported, "--out", f"{out}.png", "--own-motion", "--timestep", "1"), "give only one of them"),
         (("export", imported, "--out", f"{out}.ply", *as_folder), "writes a folder"),
         (("export", imported, *into, *as_folder, "--every", "2"), "holds every timestep"),
         (("export", imported, "--out", f"{out}.mien", "--format", "ply"), "does not end in .ply"),

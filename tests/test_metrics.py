@@ -180,7 +180,7 @@ def test_the_command_shows_it_beside_the_others(tmp_path: Path, monkeypatch: pyt
         cv2.imwrite(str(tmp_path / folder / "0.png"), random.integers(0, 255, (64, 64, 3)).astype(np.uint8))
     shutil.copy(tmp_path / "truth/0.png", tmp_path / "truth/1.png")
     shutil.copy(tmp_path / "truth/0.png", tmp_path / "images/1.png")
-    command = ["evaluate", "--images", str(tmp_path / "images"), "--truth", str(tmp_path / "truth")]
+    command = ["evaluate", "images", str(tmp_path / "images"), str(tmp_path / "truth")]
     out = tmp_path / "scores.json"
     assert main([*command, "--lpips-weights", str(tmp_path / "trunk.pth"), "--no-perceptual", "--out", str(out)]) == 0
     shown = capsys.readouterr().out

@@ -22,7 +22,7 @@ from mien.avatar.methods import METHODS
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.settings import Progress, Rate, RefillSettings
 from mien.camera import Camera
-from mien.commands.parsing.settings_options import leaves
+from mien.commands.parsing import field_docs
 from mien.disk.config import FRACTION, NotBelow, Range, check_ranges
 from mien.errors import UserError
 from mien.training import PRESETS, TrainSettings, train, trainer
@@ -32,7 +32,8 @@ from mien.training.footage.frames import LEAST_EXTENT, Frame, camera_extent
 from mien.training.settings import MAIN_SETTINGS
 from plain_settings import plain_gaussian_avatars
 from refusals import refuses
-from test_settings import help_of, with_file
+from test_cli import help_of
+from test_settings import with_file
 from toy_scene import toy_face, toy_face_model, toy_sequence
 
 HERE = Path(__file__).parent
@@ -347,16 +348,24 @@ def about_options(help_text: str) -> dict[str, str]:
     return about
 
 
+def described(settings: Any, prefix: str) -> Iterator[tuple[str, str]]:
+    """Yield every option of some settings, with the text below its field."""
+    for one in fields(settings):
+        value, option = getattr(settings, one.name), prefix + one.name.replace("_", "-")
+        if is_dataclass(value):
+            yield from described(value, f"{option}.")
+        else:
+            yield option, field_docs(type(settings))[one.name]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = help_of(capsys, "train", "--method", method, "--help-all")
     about, default = about_options(text), METHODS[method].config()
-    assert [leaf for leaf in leaves(default, "method") if f" {leaf.heading} options " not in text] == []
     for prefix, settings in (("method", default), ("training", TrainSettings())):
-        for leaf in leaves(settings, prefix):
-            option = leaf.option(prefix if leaf.name not in MAIN_SETTINGS else "").replace("--.", "--")
-            assert leaf.about[0].isupper(), option
-            assert option in about or option in ("--held-out-sequences", "--held-out-cameras")
+        for option, description in described(settings, f"--{prefix}."):
+            assert description[0].isupper(), option
+            assert option in about or option.removeprefix("--training.").replace("-", "_") in MAIN_SETTINGS
 
 
 def test_help_all_shows_the_values_of_a_preset_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,10 +55,10 @@ capture gone.mp4 --out w; capture a.mp4 --out w --capture.size 3; capture a.mp4 
 create gone.mp4 --out w; create a.mp4 --out w --steps -3; create a.mp4 --out w --method nerf;
 create a.mp4 --out w --method.sh-degree 9; create a.mp4 --out w --config gone.json; create a.mp4 --out a.csv;
 track gone; track .; train gone; train w --hold-out nobody; evaluate; evaluate w --run nobody; evaluate w w;
-evaluate --images gone --truth gone; evaluate w --perceptual-frames -1; analyze gaussian-avatars gone;
+evaluate images gone gone; evaluate w --perceptual-frames -1; analyze gaussian-avatars gone;
 analyze gaussian-avatars w --run nobody; analyze gaussian-avatars w --parts hair; import gone --out n;
 import w --out n --dataset nobody; render gone --out a.png; render w --out a.gif; render w --out b.png --size 9999;
-render w --out b.png --background pinkish; render w --out b.mp4 --sequence nobody; drive gone --by a.csv --out b.mp4;
+render w --out b.png --background pinkish; render w --out b.mp4 --motion nobody; drive gone --by a.csv --out b.mp4;
 drive w --by gone --out b.mp4; drive w --by a.csv --out b.mp4 --fps 0; drive w --by camera:/dev/video99;
 drive w --by camera --port 99999; view gone.mien; view w --port 99999; view w --play nobody; export w --out a.obj;
 export w --out gone.ply --series nobody; face-models --name x; face-models --add gone.npz; bench scaling --plot a.txt;
@@ -268,7 +268,7 @@ def test_a_head_that_the_filmed_frame_cuts_off_is_shown_whole(tmp_path: Path, mo
 def test_a_file_refuses_what_only_a_run_has(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     render = ["render", str(exported), "--out", str(tmp_path / "a.png")]
     for option, told in (
-        ("--timestep 0", "a file"), ("--own-motion", "a file"), ("--sheet turntable", "a file"), ("--run x", "a file"),
+        ("--timestep 0", "a file"), ("--motion own", "a file"), ("--path captured", "a file"), ("--run x", "a file"),
         ("--set dorp=1", "did you mean drop?"),
     ):  # fmt: skip
         assert told in complaint(capsys, *render, *option.split())

@@ -1,4 +1,4 @@
-"""What a terminal shows is harmless and ends quietly, with the remaining time, and odd places give the same bytes."""
+"""What a terminal shows is harmless and ends quietly, and odd places give the same bytes."""
 
 import hashlib
 import io
@@ -21,12 +21,9 @@ from mien import runtime
 from mien.cli import main
 from mien.disk import reading as bounded
 from mien.machine import progress, system
-from mien.machine.progress import Overall, Piece, progress_bar, say, whole_command
+from mien.machine.progress import current_stage, progress_bar, say, stages
 from mien.machine.terminal import plain_name, printable, show
 from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
-from mien.pipeline.expected import count_scored, expected_pieces
-from mien.tracking.settings import TrackingSettings
-from mien.training import TrainSettings
 from needs import find_test_data
 from refusals import refuses
 from shared_things import write_toy_workspace
@@ -152,10 +149,6 @@ def test_threads_that_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (asked_threads(), thread_count()) == (None, os.cpu_count())
 
 
-SETTINGS = TrainSettings(steps=12_000)
-TWO = [Piece("capture", "capture ", 10.0), Piece("training", "training", 190.0)]
-
-
 class Clock:
     """Clock that a test sets."""
 
@@ -165,8 +158,6 @@ class Clock:
     def monotonic(self) -> float:
         return self.now
 
-    __call__ = monotonic
-
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
@@ -175,76 +166,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-def pieces_of(frames: int, settings: TrainSettings = SETTINGS) -> list[Piece]:
-    return expected_pieces([frames], count_scored([frames], ["me"], settings), TrackingSettings(), settings, "auto")
-
-
-def test_current_stages_take_no_time_and_other_bars_do_not_count() -> None:
-    clock, pieces = Clock(), pieces_of(500)
-    scoring = sum(piece.seconds for piece in pieces if piece.stage == "scoring")
-    overall = Overall(pieces, clock)
-    assert overall.remaining() == pytest.approx(sum(piece.seconds for piece in pieces))
-    assert overall.begin("training", 0.5)  # capture and tracking are current; the run resumes
-    assert overall.stage() == 3
-    assert overall.remaining() == pytest.approx(12_000 * 0.042 / 2 + scoring)
-    clock.now += 100.0
-    overall.advance(0.75)
-    assert overall.remaining() == pytest.approx(100.0 + scoring)
-    overall = Overall(pieces, Clock())
-    assert overall.begin("capture me-1", 0.0)
-    overall.end()
-    left = overall.remaining()
-    assert overall.begin("capture me-2", 0.0), "another part of a clip is the same piece"
-    overall.end()
-    assert (overall.stage(), overall.remaining()) == (1, pytest.approx(left, rel=0.05))
-    assert not overall.begin("decode me-1", 0.0)
-    assert not overall.begin("find the face in me.mp4", 0.0), "time does not run backwards"
-    assert overall.stage() == 1
-
-
-def test_pieces_follow_the_settings() -> None:
-    assert {piece.stage for piece in pieces_of(100, TrainSettings(split="none"))} == {"capture", "tracking", "training"}
-    without = expected_pieces([100, 50], 0, TrackingSettings(schedule="landmarks"), SETTINGS, "none")
-    assert not {"Overlay", "Fitting to pixels"} & {piece.title for piece in without}
-    assert sum(piece.title == "Scoring masks" for piece in without) == 2
-    assert count_scored([100, 50], ["a", "b"], TrainSettings(held_out_sequences=("b",), split="none")) == 50
-    assert count_scored([100, 50], ["a", "b"], TrainSettings(held_out_sequences=("b",))) == 70
-
-
-def test_a_bar_has_the_whole_command_beside_it(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(progress, "console", Console(file=sys.stderr, width=150, force_terminal=True))
-    clock = Clock()
-    with whole_command(Overall(TWO, clock)):
-        with progress_bar("capture me", 2) as advance:
-            clock.now += 5.0
-            advance(status="sharp")
-            advance()
-        with progress_bar("decode", 1) as advance:
-            advance(status="alone")
-    shown = capsys.readouterr().err
-    assert "sharp; all: stage 1 of 2, about 3 min" in shown
-    assert "alone; all" not in shown
-
-
-def test_a_log_has_a_line_at_each_stage_and_now_and_then(clock: Clock, capsys) -> None:
-    with whole_command(Overall(TWO, clock)):
-        with progress_bar("capture me", 1) as advance:
-            clock.now += 10.0
-            advance()
-        with progress_bar("training", 4) as advance:
-            for _ in range(4):
-                clock.now += 70.0
-                advance()
-    with progress_bar("training", 1) as advance:
-        advance()
-    ending = " left of the whole command"
-    lines = [line.removesuffix(ending) for line in capsys.readouterr().err.splitlines() if line.endswith(ending)]
-    assert lines == [
-        "stage 1 of 2 (capture), about 3 min", "stage 2 of 2 (training), about 3 min",
-        "stage 2 of 2 (training), about 4 min", "stage 2 of 2 (training), about 2 min",
-        "stage 2 of 2 (training), about 70 s", "stage 2 of 2 (training), less than 10 s",
-    ]  # fmt: skip
+def test_stages_are_told(capsys) -> None:
+    with stages("capture", "training") as begin:
+        begin("training")
+        assert current_stage() == "training"
+    assert current_stage() is None
+    assert capsys.readouterr().err == "stage 2 of 2 (training)\n"
 
 
 @pytest.mark.parametrize(("durations", "status", "told"), [

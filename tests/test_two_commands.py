@@ -88,7 +88,7 @@ def test_readers_go_on_beside_every_lock(other: Holder, studio: Studio, tmp_path
             f"export {root} --run alone --out {out}/folder --format gaussian-avatars",
             f"import {out}/folder --out {root} --run imported-{out.name}",
             f"analyze gaussian-avatars {root} --run alone --parts growth --out {out}/analysis",
-            f"evaluate {root} --run alone --compare --out {out}/a.html",
+            f"evaluate compare {root} --run alone --out {out}/a.html",
             f"capture {studio.video} --out {root} --name clip {' '.join(studio.capture_options)}",
             f"track {root} --face-model toy --overlay none",
             f"train {root} --run alone --steps 3 --split tail {' '.join(RANK)}",

@@ -4,23 +4,20 @@ import contextlib
 import difflib
 import errno
 import importlib
-import inspect
 import io
 import os
-import re
 import shlex
 import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import mien
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.machine.stops import EXIT_INTERRUPTED, Terminated, orderly_stops
-from mien.machine.terminal import drop_output, open_closed_streams, printable, show, tell
+from mien.machine.terminal import drop_output, open_closed_streams, show, tell
 from mien.machine.threads import asked_threads, use_one_torch_thread
 from mien.plugins import missing_package
 
@@ -149,71 +146,19 @@ def _crash() -> int:
     return 1
 
 
-def _run(name: str, rest: list[str]) -> int:
-    import tyro
-
-    from mien.commands.parsing.complaints import complaint_of
-    from mien.commands.parsing.help_text import at_a_glance, list_options, readable, without_details
-    from mien.commands.parsing.options import settings_groups, with_settings
+def _run(name: str, arguments: list[str]) -> int:
+    from mien.commands.parsing import parse
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
-    module = importlib.import_module("mien.commands." + name.replace("-", "_"))
-    rest, for_all = _for_all_rows(name, rest)
-    for option in list_options(module.Command):
-        if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:
-            # The first of its values would be dropped without a word.
-            raise UserError(f"{option} is given twice; give it once, followed by all of its values")
-    options, more = module.Command, ""
-    if "--help-all" in rest:
-        rest = ["--help" if argument == "--help-all" else argument for argument in rest]
-        options = readable(with_settings(module.Command, rest))
-    elif "-h" in rest or "--help" in rest:
-        options, groups = without_details(module.Command)
-        glance = at_a_glance(module.Command, name)
-        options = readable(glance or options)
-        further, words = settings_groups(module.Command, rest)
-        names = ", ".join(f"--{group}.*" for group in groups + further)
-        names += ", and others" if glance is not None else ""
-        more = f"More options ({names}): mien {name}{words} --help-all" if names else ""
-    else:
-        options = with_settings(module.Command, rest)
-    complaints, style = io.StringIO(), (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
-    try:
-        with contextlib.redirect_stderr(complaints):
-            command = tyro.cli(
-                options,
-                prog=f"mien {name}",
-                description=inspect.getdoc(module.Command),
-                args=rest,
-                config=style,
-            )
-    except SystemExit as stop:
-        if stop.code != EXIT_USER_ERROR:
-            if more:
-                show(more)
-            raise
-        complaint = complaint_of(complaints.getvalue(), rest, options, style)
-        # The short help leaves out the options of groups, whose names have a dot.
-        every = "-all" if re.search(r"--[a-z-]+\.[a-z]", complaint) else ""
-        raise UserError(f"{complaint}; see mien {name} --help{every}") from None
-    sys.stderr.write(printable(complaints.getvalue(), lines=True))
+    command = parse(importlib.import_module("mien.commands." + name.replace("-", "_")), name, arguments)
     asked_threads()
-    command = replace(command, for_all=for_all) if for_all else command
-    command.check()
+    if hasattr(command, "check"):
+        command.check()
     with orderly_stops():
         use_one_torch_thread()
         _check_instruction_set()
         command.run()
     return 0
-
-
-def _for_all_rows(name: str, rest: list[str]) -> tuple[list[str], dict[str, list[str]]]:
-    """The arguments of a sub-command, and the options of `mien create` that `mien batch` takes for all rows."""
-    if name != "batch":
-        return rest, {}
-    from mien.commands.batch_table import for_all_rows
-
-    return for_all_rows(rest)
 
 
 def _check_instruction_set() -> None:

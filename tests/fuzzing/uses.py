@@ -26,8 +26,7 @@ from mien.capture.cameras.calibration import CalibratedCamera
 from mien.capture.cameras.readings import readings_of
 from mien.capture.person.crop import whole_picture
 from mien.capture.person.given import GivenMattes
-from mien.commands.parsing.config_file import ConfigFile
-from mien.commands.parsing.options import TrainOptions, with_settings
+from mien.commands.train_options import ConfigFile, TrainOptions
 from mien.datasets.dataset import TrainedAvatar
 from mien.datasets.registry import datasets, recognised
 from mien.datasets.writing import write_sequence
@@ -268,7 +267,7 @@ def _draw(gaussians: Any, camera: Any = None) -> None:
 
 def use_comparison(root: Path, found: Any, dice: Random) -> None:
     for more in ("", " --json"):
-        run_line(f"evaluate {{W}} --compare{more}", root)
+        run_line(f"evaluate compare {{W}}{more}", root)
 
 
 def use_avatar(root: Path, found: Any, dice: Random) -> None:
@@ -345,13 +344,8 @@ def use_rig(root: Path, found: list[CalibratedCamera], dice: Random) -> None:
 
 def use_config(root: Path, found: ConfigFile, dice: Random) -> None:
     """Make the options of `mien train` of the file, as its command line does, and check them."""
-    from mien.commands.train import Command
-
     method = ["--method", dice.choice(list(METHODS))] if found.method is None else []
-    command = with_settings(Command, ["--config", str(found.path), *method])
-    options = next(field for field in fields(command) if field.name == "options").default_factory()  # type: ignore[misc]
-    assert isinstance(options, TrainOptions)
-    options.check()
+    TrainOptions.chosen(["--config", str(found.path), *method]).check()
     if dice.random() < 0.3:
         with contextlib.suppress(UserError):  # there is no such workspace
             run_line(f"train {{root}}/none --config {found.path}", root)

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.parsing.help_text import Described
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.lab.analysis.registry import ANALYSES, Analysis, AnalysisOptions, chosen_parts
@@ -25,7 +24,7 @@ class Command:
     continues where it was, and what is measured is not measured again.
     """
 
-    target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_target)]
+    target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), _about_target]
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     parts: tuple[str, ...] = ()

@@ -1,12 +1,11 @@
 """The table of a batch: captures as csv, json or a folder of videos, turned into rows with commands of mien."""
 
-import contextlib
 import csv
 import difflib
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,16 @@ from mien.batch.plan import WORKSPACE, Row, with_fingerprint
 from mien.batch.results import RESULT_COLUMNS
 from mien.batch.store import is_url
 from mien.capture.settings import CaptureSettings
-from mien.commands import create
-from mien.commands.parsing.complaints import complaint_of
-from mien.commands.parsing.options import TrainOptions, check_method, with_settings
+from mien.commands import create, train
+from mien.commands.parsing import parse_options
+from mien.commands.train_options import Details, TrainOptions, check_method
 from mien.disk.inside import is_plain_name, listed
 from mien.disk.reading import parse_json, read_bytes
 from mien.disk.tables import table_rows, text_of, with_point
 from mien.disk.workspace import check_no_workspace
 from mien.errors import UserError
 from mien.tracking.settings import ScoringSettings, TrackingSettings
-from mien.training.settings import AlignmentSettings, TrainSettings
+from mien.training.settings import AlignmentSettings
 
 _MAX_TABLE_BYTES = 64 << 20
 _VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})
@@ -43,27 +42,26 @@ _PATHS = frozenset(
 """Options that name a file. It may be given beside the table."""
 _OF_IMPORT, _OF_SCORES = ("face-model", "retrack"), ("protocol",)
 """Options of `mien import` and of `mien evaluate` that the row of a dataset may have."""
-_GROUPS = ("capture", "tracking", "alignment", "scoring", "training", "method")
-_SETTINGS = {
-    group: {each.name for each in fields(settings)}
-    for group, settings in (
-        ("capture", CaptureSettings),
-        ("tracking", TrackingSettings),
-        ("alignment", AlignmentSettings),
-        ("scoring", ScoringSettings),
-        ("training", TrainSettings),
-    )
+_GROUPS = {
+    "capture": CaptureSettings,
+    "tracking": TrackingSettings,
+    "alignment": AlignmentSettings,
+    "scoring": ScoringSettings,
+    "training": Details,
+    "method": None,
 }
-"""Group of options -> names of its settings."""
-_ON = {
-    prefix + one.name.replace("_", "-")
-    for prefix, kind in (("", TrainOptions), ("capture.", CaptureSettings), ("tracking.", TrackingSettings))
-    for one in fields(kind)
+"""Group of options -> its settings. Those of methods differ."""
+_OF_TRAIN = {one.name.replace("_", "-") for one in fields(TrainOptions)} - {"method", "training", "method-settings"}
+_OF_CREATE = {one.name.replace("_", "-") for one in fields(create.Command)} - {
+    *_OF_BATCH, *_GROUPS, "videos", "preview", "options", "name"}  # fmt: skip
+_FLAGS_ON = {
+    f"{group}.{one.name.replace('_', '-')}"
+    for group, kind in _GROUPS.items()
+    for one in (fields(kind) if kind else ())
     if one.default is True
-}
-"""Flags that are on unless they are turned off."""
+} | {"face-tuning"}
+"""Flags that are on unless they are turned off: --no-face-tuning, --capture.no-cuts."""
 _NO = re.compile(r"(^|\.)no-")
-"""Marks a flag that is turned off: --no-face-tuning, --capture.no-cuts."""
 _NUMBER = re.compile(r"-[0-9.]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 _DECIMAL = re.compile(r"-?[0-9]+,[0-9]+")
 """A number with a decimal comma."""
@@ -71,48 +69,46 @@ _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 """Memory of a row in megabytes: at least, and for each frame. 10 minutes of video take less than 3 GiB."""
 
 
-def for_all_rows(arguments: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
-    """Take the options of `mien create` out of the arguments of `mien batch`: they count for all rows.
-
-    Returns:
-        The other arguments, and the words of each option by its column.
-    """
-    options: dict[str, list[str]] = {}
-    words = others = list[str]()
-    for argument in arguments:
-        typed, equals, value = argument.partition("=")
-        if argument.startswith("--"):
-            column, words = _NO.sub(r"\1", _column(typed)), others
-            if column in (*_options(), "method", "memory-gb", "view") or column.partition(".")[0] in _GROUPS:
-                if column in options:
-                    raise UserError(f"--{column} is given twice; give it once, followed by all of its values")
-                words = options[column] = [value] if equals else ["no"] if column != _column(typed) else []
-                continue
-        words.append(argument)
-    return others, {column: words or ["yes"] for column, words in options.items()}
-
-
-def read_table(path: Path, for_all: Mapping[str, Sequence[str]] | None = None) -> list[Row]:
+def read_table(path: Path, for_all: Sequence[str] = ()) -> list[Row]:
     """The rows of a table.
 
     Args:
         path: A csv, a json, or a folder of videos.
-        for_all: Options of all rows, as `for_all_rows` returns them. A cell of the table goes first.
+        for_all: Options of `mien create` for all rows, as they were typed. A cell of the table goes first.
     """
+    usual, kinds = _columns_of(for_all), set[str]()
     entries = list(_entries(path))
     if not entries:
         raise UserError(f"{path}: has no rows; give a table of captures, or a folder of videos")
-    rows, kinds = [], set[str]()
-    usual = {column: _from_here(column, words) for column, words in (for_all or {}).items()}
-    _check_names(usual, "options of all rows")
-    for number, entry in enumerate(entries, 1):
-        row = _row(path.parent if path.is_file() else path, entry, f"{path}, row {number}", kinds, usual)
-        rows.append(row)
-    names = [row.name for row in rows]
-    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
-    if twice is not None:
-        raise UserError(f"{path}: two rows have the name {twice!r}; give each row a name of its own")
+    place = path.parent if path.is_file() else path
+    rows = [_row(place, entry, f"{path}, row {number}", kinds, usual) for number, entry in enumerate(entries, 1)]
+    _check_twice([row.name for row in rows], str(path), "two rows have the name {!r}; give each row its own")
     return rows
+
+
+def _columns_of(words: Sequence[str]) -> dict[str, list[str]]:
+    """The words of each option that was typed, by its column. Paths are relative to the current folder."""
+    columns: dict[str, list[str]] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if word.startswith("--"):
+            column = _NO.sub(r"\1", _column(name))
+            if column in columns:
+                raise UserError(f"--{column} is given twice; give it once, followed by all of its values")
+            columns[column] = [value] if equals else ["no"] if column != _column(name) else []
+        elif not columns:
+            raise UserError(f"unknown: {word}; give one table of captures, or one folder of videos")
+        else:
+            columns[[*columns][-1]].append(word)
+    _check_names(columns, "options of all rows")
+    for column, found in columns.items():
+        if column in {*_OWN} - {"method", "memory-gb"} or not (column in _OWN or _is_option(column)):
+            near = difflib.get_close_matches(column, _known(), 1)
+            hint = f"; did you mean --{near[0]}?" if near else ""
+            raise UserError(f"unknown: --{column}{hint}; see mien batch --help, and mien create --help-all")
+        resolved = [str(Path(word).resolve()) if column in _PATHS and _exists(Path(word)) else word for word in found]
+        columns[column] = resolved or ["yes"]
+    return columns
 
 
 def _entries(path: Path) -> Iterator[dict[str, Any]]:
@@ -125,10 +121,6 @@ def _entries(path: Path) -> Iterator[dict[str, Any]]:
         text = read_bytes(path, _MAX_TABLE_BYTES)
         is_json = path.suffix.lower() == ".json"
         content = parse_json(text_of(text), unique_names=True) if is_json else _lines(text, path)
-    except FileNotFoundError:
-        raise UserError(
-            f"{path}: no such file or folder; give a csv or json of captures, or a folder of videos"
-        ) from None
     except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as a csv or a json list of objects ({error}); correct it") from None
     if isinstance(content, dict):
@@ -139,26 +131,25 @@ def _entries(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _lines(text: bytes, path: Path) -> list[dict[Any, Any]]:
-    """The lines of a csv by column. Cells beyond the heading have the name None."""
+    """The lines of a csv by column."""
     rows = [row for _, row in table_rows(io.BytesIO(text))]
     heading = rows[0] if rows else []
     _check_names(heading, str(path))
-    return [
-        dict(zip(heading, row, strict=False)) | ({None: row[len(heading) :]} if len(row) > len(heading) else {})
-        for row in rows[1:]
-    ]
+    for number, row in enumerate(rows[1:], 1):
+        if len(row) > len(heading):
+            raise UserError(
+                f"{path}, row {number}: has more cells than the heading has columns; put texts with commas in quotes"
+            )
+    return [dict(zip(heading, row, strict=False)) for row in rows[1:]]
 
 
 def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str], usual: Mapping[str, Sequence[str]]) -> Row:
-    if None in entry:
-        raise UserError(f"{where}: has more cells than the heading has columns; put texts with commas in quotes")
     _check_names(map(str, entry), where)
     cells = {_column(key): _words(value, key, where) for key, value in entry.items()}
     original = {key: f"--{key}" for key in usual} | {_column(key): str(key).strip() for key in entry}
     cells = {key: words for key, words in cells.items() if words}
     cells |= {key: [*words] for key, words in usual.items() if not {key, "methods" * (key == "method")} & {*cells}}
-    videos = cells.get("video", []) + cells.get("videos", [])
-    dataset = cells.get("dataset", [])
+    videos, dataset = cells.get("video", []) + cells.get("videos", []), cells.get("dataset", [])
     if videos and dataset:
         raise UserError(f"{where}: give it a video or a dataset, and not both")
     if not (videos or dataset):
@@ -173,22 +164,19 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str], usual
     for method in methods:
         check_method(where, method)
     _check_twice(methods, where, "method {!r} is there twice; name it once")
-    known = [*_options(), *({*_OF_IMPORT, *_OF_SCORES} - {"face-model"})]
     options, labels = {}, {}
     for key, words in cells.items():
         if key in _OWN:
             continue
         words = [with_point(word) if _DECIMAL.fullmatch(word) else word for word in words]
-        if key in known or key.partition(".")[0] in _GROUPS and "." in key:
-            _check_words(words, original[key], where)
-            options[key] = [
-                _input(folder, word, where) if key in _PATHS and _must_exist(folder, key, word) else word
-                for word in words
-            ]
-            continue
-        _check_label(key, original[key], known, where)
-        labels[original[key]] = ";".join(words)
-    _check_columns(options, original, bool(dataset), where)
+        if _is_option(key):
+            _check_option(key, words, original[key], bool(dataset), where)
+            # A face model may be a name instead of a file.
+            is_path = key in _PATHS and (key != "face-model" or _exists(folder / words[0]))
+            options[key] = [_input(folder, word, where) if is_path else word for word in words]
+        else:
+            _check_label(key, original[key], where)
+            labels[original[key]] = ";".join(words)
     steps = _steps(inputs, bool(dataset), methods, options)
     _check(steps, where, kinds)
     files = [Path(word) for words in (inputs, *options.values()) for word in words if not is_url(word)]
@@ -196,14 +184,22 @@ def _row(folder: Path, entry: dict[str, Any], where: str, kinds: set[str], usual
     return with_fingerprint(row, [path for path in files if _exists(path)])
 
 
-def _from_here(name: str, words: Sequence[str]) -> list[str]:
-    """The words of an option that was typed: paths are relative to the current folder, not to the table."""
-    return [str(Path(word).resolve()) if name in _PATHS and _exists(Path(word)) else word for word in words]
-
-
 def _column(name: str) -> str:
     """The name of a column as that of an option: capture_size, --capture-size and capture-size are one."""
     return str(name).strip().removeprefix("--").replace("_", "-")
+
+
+def _known() -> list[str]:
+    """Every column that is an option, but for those of methods."""
+    of_groups = {
+        f"{group}.{one.name.replace('_', '-')}" for group, kind in _GROUPS.items() if kind for one in fields(kind)
+    }
+    return sorted({*_OF_CREATE, *_OF_TRAIN, *_OF_IMPORT, *_OF_SCORES} | of_groups)
+
+
+def _is_option(column: str) -> bool:
+    group, dot, _ = column.partition(".")
+    return bool(dot) and group in _GROUPS or column in {*_OF_CREATE, *_OF_TRAIN, *_OF_IMPORT, *_OF_SCORES}
 
 
 def _check_names(names: Iterable[str], where: str) -> None:
@@ -228,18 +224,17 @@ def _words(value: Any, name: object, where: str) -> list[str]:
     return [text for one in each if (text := str(one).strip())]
 
 
-def _check_words(words: Iterable[str], name: str, where: str) -> None:
-    """Check that no word of an option is an option itself."""
+def _check_option(key: str, words: Iterable[str], name: str, dataset: bool, where: str) -> None:
+    """Check that an option belongs to a command of the row, and that no word of it is an option itself."""
     option = next((word for word in words if word.startswith("-") and not _NUMBER.fullmatch(word)), None)
     if option is not None:
         raise UserError(
             f"{where}: column {name!r} holds {option!r:.80}, which would be an option; give each option a column"
         )
-
-
-def _must_exist(folder: Path, key: str, word: str) -> bool:
-    """Whether a path has to exist. A face model may be a name instead."""
-    return key != "face-model" or _exists(folder / word)
+    if not dataset and key in ("retrack", *_OF_SCORES):
+        raise UserError(f"{where}: column {name!r} is for datasets; leave it empty where there is a video")
+    if dataset and not (_of_training(key) or key in (*_OF_IMPORT, *_OF_SCORES)):
+        raise UserError(f"{where}: column {name!r} is for videos; leave it empty where there is a dataset")
 
 
 def _exists(path: Path) -> bool:
@@ -251,18 +246,13 @@ def _exists(path: Path) -> bool:
 
 
 def _check_twice(words: Sequence[str], where: str, complaint: str) -> None:
-    twice = next((word for word in words if words.count(word) > 1), None)
-    if twice is not None:
-        raise UserError(f"{where}: {complaint.format(twice)}")
+    if len({*words}) < len(words):
+        raise UserError(f"{where}: {complaint.format(next(word for word in words if words.count(word) > 1))}")
 
 
-def _check_label(column: str, name: str, known: Sequence[str], where: str) -> None:
-    """Check that a label is none: a misspelt option, a setting with a dash for its dot, or a column of the results."""
-    group, _, setting = column.partition("-")
-    if setting.replace("-", "_") in _SETTINGS.get(group, ()):
-        near = [f"{group}.{setting}"]
-    else:
-        near = difflib.get_close_matches(column, known, 1, 0.8) or difflib.get_close_matches(column, _OWN, 1, 0.75)
+def _check_label(column: str, name: str, where: str) -> None:
+    """Check that a label is neither a misspelt option nor a column of the results."""
+    near = difflib.get_close_matches(column, [*_known(), *_OWN], 1, 0.8)
     if near:
         raise UserError(f"{where}: column {name!r} is no option; did you mean {near[0]!r}? Labels need other names")
     if name in RESULT_COLUMNS:
@@ -278,54 +268,25 @@ def _input(folder: Path, word: str, where: str) -> str:
     return str(path.resolve())
 
 
-def _options() -> list[str]:
-    """The options of `mien create` that a column may set, without settings of groups."""
-    own = {one.name for one in fields(create.Command)} - {
-        "videos",
-        "out",
-        "view",
-        "preview",
-        "options",
-        "run_name",
-        "name",
-    }
-    train = {one.name for one in fields(TrainOptions)} - {"method"}
-    return sorted(name.replace("_", "-") for name in (own | train) - {*_GROUPS})
-
-
-def _check_columns(options: dict[str, list[str]], original: dict[str, str], dataset: bool, where: str) -> None:
-    """Check that each option belongs to a command of the row: videos are captured and tracked, datasets imported."""
-    for key in options:
-        if not dataset and key in (*_OF_IMPORT, *_OF_SCORES) and key != "face-model":
-            raise UserError(f"{where}: column {original[key]!r} is for datasets; leave it empty where there is a video")
-        if dataset and not (_of_training(key) or key in (*_OF_IMPORT, *_OF_SCORES)):
-            raise UserError(
-                f"{where}: column {original[key]!r} is for videos, which are captured and tracked; leave it empty "
-                "where there is a dataset"
-            )
-
-
 def _of_training(key: str) -> bool:
     """Whether an option is one of `mien train`."""
-    own = {one.name.replace("_", "-") for one in fields(TrainOptions)}
-    return key in own or key.startswith(("method.", "training."))
+    return key in _OF_TRAIN or key.startswith(("method.", "training."))
 
 
 def _steps(inputs: list[str], dataset: bool, methods: Sequence[str], options: dict[str, list[str]]) -> list[list[str]]:
     """The commands of a row: tracked once, trained by each method."""
-
-    def typed(wanted: Callable[[str], bool]) -> list[str]:
-        return [word for key, words in options.items() if wanted(key) for word in _typed(key, words)]
-
-    trained = typed(_of_training)
+    typed = {key: _typed(key, words) for key, words in options.items()}
+    every = [word for words in typed.values() for word in words]
+    trained = [word for key, words in typed.items() if _of_training(key) for word in words]
+    imported = [word for key in _OF_IMPORT for word in typed.get(key, ())]
     if dataset:
         # A row that is tried again goes on where it stopped.
-        steps = [["import", *inputs, "--out", WORKSPACE, "--resume", *typed(lambda key: key in _OF_IMPORT)]]
+        steps = [["import", *inputs, "--out", WORKSPACE, "--resume", *imported]]
     else:
-        steps = [["create", *inputs, "--out", WORKSPACE, "--method", methods[0], *typed(lambda key: True)]]
+        steps = [["create", *inputs, "--out", WORKSPACE, "--method", methods[0], *every]]
     for method in methods if dataset else methods[1:]:
         steps.append(["train", WORKSPACE, "--method", method, *trained])
-        steps.append(["evaluate", WORKSPACE, "--run", method, *typed(lambda key: key in _OF_SCORES)])
+        steps.append(["evaluate", WORKSPACE, "--run", method, *typed.get("protocol", ())])
     return steps
 
 
@@ -336,46 +297,35 @@ def _typed(key: str, words: list[str]) -> list[str]:
     is_on = words[0].lower() in ("true", "yes")
     if key.startswith(("training.", "method.")):  # their flags take a value
         return [f"--{key}", str(is_on)]
-    if key in _ON:
+    if key in _FLAGS_ON:
         group, dot, flag = key.rpartition(".")
         return [] if is_on else [f"--{group}{dot}no-{flag}"]
     return [f"--{key}"] if is_on else []
 
 
 def _check(steps: list[list[str]], where: str, kinds: set[str]) -> None:
-    """Check the options of the first command, once for each kind of row."""
-    import tyro
-
-    first = steps[0]
-    words = ["one.mp4" if Path(word).is_absolute() or is_url(word) else word for word in first]
-    kind = json.dumps(words)
-    if kind in kinds or first[0] != "create":
+    """Check the options of the first command that has some of the table, once for each kind of row."""
+    name, *words = next(step for step in steps if step[0] != "import")
+    words = ["one.mp4" if Path(word).is_absolute() or is_url(word) else word for word in words]
+    kind = json.dumps([name, *words])
+    if kind in kinds:
         return
     kinds.add(kind)
-    local = [word for word in first[1:] if word != WORKSPACE and not is_url(word)]
-    out = local.index("--out")
-    arguments = [*(local[:out] or ["one.mp4"]), "--out", "out", *local[out + 1 :]]
-    told = io.StringIO()
-    options: Any = create.Command
-    style = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+    if name == "create":
+        at = words.index("--out")
+        words = ["one.mp4", *words[at:]]
     try:
-        with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
-            options = with_settings(create.Command, arguments)
-            command = tyro.cli(options, args=arguments, config=style)
+        command = parse_options(create.Command if name == "create" else train.Command, f"mien {name}", words)
         command.options.check()
-        command.capture.check()
-        command.tracking.check()
-    except SystemExit:
-        why = complaint_of(told.getvalue(), arguments, options, style)
-        raise UserError(f"{where}: {why}; see mien create --help-all") from None
+        if name == "create":
+            command.capture.check()
+            command.tracking.check()
     except UserError as error:
         raise UserError(f"{where}: {error}") from None
 
 
 def _memory(cells: dict[str, list[str]], inputs: list[str], where: str) -> float:
     """Megabytes that a row needs: as its column says, or from the number of its frames."""
-    from mien.pipeline.expected import count_captured
-
     if "memory-gb" in cells:
         try:
             given = float("".join(cells["memory-gb"]))
@@ -384,5 +334,14 @@ def _memory(cells: dict[str, list[str]], inputs: list[str], where: str) -> float
         if not 0 < given < 1e6:
             raise UserError(f"{where}: memory_gb {';'.join(cells['memory-gb'])}: give a number of gigabytes above 0")
         return 1000 * given
-    videos = [Path(word) for word in inputs if not is_url(word)]
-    return _LEAST_MB + _FRAME_MB * sum(count_captured(video, CaptureSettings()) for video in videos)
+    return _LEAST_MB + _FRAME_MB * sum(_count_frames(Path(word)) for word in inputs if not is_url(word))
+
+
+def _count_frames(source: Path) -> int:
+    """About how many frames a video or a folder of pictures has; 0 if that cannot be told, which the row reports."""
+    from mien.media.video import probe_video
+
+    try:
+        return len(listed(source)) if source.is_dir() else probe_video(source).frames
+    except (UserError, OSError):
+        return 0

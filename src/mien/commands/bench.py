@@ -1,16 +1,16 @@
-"""`mien bench`: benchmarks."""
+"""Measure this machine and this version of mien."""
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.commands.parsing.options import PresetName, check_method, listed_methods
+from mien.commands.train_options import check_method, listed_methods
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
@@ -20,8 +20,6 @@ from mien.plugins import named
 
 if TYPE_CHECKING:
     import torch
-
-    from mien.lab.benchmarking.timing import BenchmarkRow
 
     StepMethod = str
 else:
@@ -37,20 +35,29 @@ _MOST_MINUTES = 100_000
 
 
 @dataclass(frozen=True)
-class Render:
-    """Measure how fast the native core draws Gaussians, forward and backward, by size, threads and instruction set."""
-
+class _Timed:
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
     seconds: float = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
+
+    def check(self) -> None:
+        """Check that there is time to measure."""
+        if not 0 < self.seconds < math.inf:
+            raise UserError(f"--seconds {self.seconds:g}: give a positive number; each row is measured for that long")
+
+
+@dataclass(frozen=True)
+class Render(_Timed):
+    """Measure how fast the native core draws Gaussians, forward and backward, by size, threads and instruction set."""
+
     device: DeviceName = "cpu"
     """Device to draw on. cuda measures gsplat on a GPU, at the sizes of the papers."""
 
     def check(self) -> None:
         """Check that CUDA has gsplat and that there is time to measure."""
+        super().check()
         check_device(self.device)
-        _check_seconds(self.seconds)
 
     def run(self) -> None:
         """Measure and print the rows."""
@@ -62,13 +69,9 @@ class Render:
 
 
 @dataclass(frozen=True)
-class Scaling:
+class Scaling(_Timed):
     """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
 
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and all rows as json, for programs."""
-    seconds: float = 0.8
-    """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     plot: Path | None = None
     """File for a chart, .svg (default: no chart)."""
 
@@ -76,7 +79,7 @@ class Scaling:
         """Check before any measurement that the chart can be written and that there is time to measure."""
         from mien.disk.files import check_writable
 
-        _check_seconds(self.seconds)
+        super().check()
         if self.plot is not None:
             if self.plot.suffix != ".svg":
                 raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
@@ -92,7 +95,7 @@ class Scaling:
 
 
 @dataclass(frozen=True)
-class TrainStep:
+class TrainStep(_Timed):
     """Measure a training step (no footage is needed), and posing together with drawing."""
 
     method: StepMethod = DEFAULT_METHOD
@@ -102,8 +105,6 @@ class TrainStep:
     """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
     A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
     fastest round."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the machine and all rows as json, for programs."""
     seconds: float = 3.0
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
@@ -111,8 +112,8 @@ class TrainStep:
 
     def check(self) -> None:
         """Check that CUDA has gsplat and that there is time to measure."""
+        super().check()
         check_device(self.device)
-        _check_seconds(self.seconds)
         if self.method not in GPU_BENCHMARKS and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
         if self.parts and self.method != DEFAULT_METHOD:
@@ -123,7 +124,9 @@ class TrainStep:
     def run(self) -> None:
         """Measure and print the rows."""
         if self.parts:
-            _show_parts(self.seconds, self.as_json)
+            from mien.lab.benchmarking.step_parts import format_parts, parts_suite
+
+            show_rows(parts_suite(self.seconds), self.as_json, as_text=format_parts)
             return
         like = _gpu(self.device) if self.method in GPU_BENCHMARKS else None
         if like is None:
@@ -144,8 +147,6 @@ class Quality:
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
     steps: int = 0
     """Number of optimiser steps. 0 means each capture's own number."""
-    align: bool = True
-    """Align frames of one camera before training, as `mien create` does (--no-align: train on the tracking)."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -161,7 +162,7 @@ class Quality:
         """Run every capture through all stages, then print the table."""
         from mien.pipeline.quality import run_quality_stage
 
-        run_quality_stage(self.out, self.captures, self.method, self.steps, aligned=self.align, as_json=self.as_json)
+        run_quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
 
 
 @dataclass(frozen=True)
@@ -183,8 +184,6 @@ class Compare:
     means --steps."""
     steps: int = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
-    preset: PresetName = "standard"
-    """How thorough the training is."""
     split: Literal["blocks", "tail"] = "blocks"
     """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
     captures have their own."""
@@ -196,7 +195,6 @@ class Compare:
     def check(self) -> None:
         """Check without heavy libraries that there is something to compare, and that it can be written."""
         from mien.disk.files import check_writable
-        from mien.training.settings import PRESETS
 
         if not self.workspaces and not self.captures:
             raise UserError("nothing to compare on; give workspace folders, or --captures NAME")
@@ -210,7 +208,6 @@ class Compare:
             raise UserError("--methods: give at least one method")
         for method in self.methods:
             check_method("--methods", method)
-            PRESETS[self.preset].config(method)
         roots = [folder.resolve() for folder in self.workspaces]
         names = [root.name for root in roots] + list(self.captures)
         twice = next((name for name in names if names.count(name) > 1), None)
@@ -225,55 +222,12 @@ class Compare:
         from mien.pipeline.comparing import Budget, CompareSettings, run_compare_stage
 
         methods = tuple(dict.fromkeys(self.methods))
-        settings = CompareSettings(methods, self.preset, Budget(self.minutes, self.steps), self.split)
+        settings = CompareSettings(methods, Budget(self.minutes, self.steps), self.split)
         opened = [open_workspace(folder) for folder in self.workspaces]
         run_compare_stage(self.out, opened, self.captures, settings, as_json=self.as_json)
 
 
-@dataclass(frozen=True)
-class Command:
-    """Measure this machine and this version of mien: `mien bench render | train-step | scaling | quality | compare`."""
-
-    what: Annotated[
-        Annotated[Render, tyro.conf.subcommand("render", prefix_name=False)]
-        | Annotated[TrainStep, tyro.conf.subcommand("train-step", prefix_name=False)]
-        | Annotated[Scaling, tyro.conf.subcommand("scaling", prefix_name=False)]
-        | Annotated[Quality, tyro.conf.subcommand("quality", prefix_name=False)]
-        | Annotated[Compare, tyro.conf.subcommand("compare", prefix_name=False)],
-        tyro.conf.arg(name=""),
-    ]
-
-    def check(self) -> None:
-        """Check the options of the chosen benchmark."""
-        self.what.check()
-
-    def run(self) -> None:
-        """Run the chosen benchmark."""
-        self.what.run()
-
-
-def _check_seconds(seconds: float) -> None:
-    if not 0 < seconds < math.inf:
-        raise UserError(f"--seconds {seconds:g}: give a positive number; each row is measured for that long")
-
-
-def _show_parts(seconds: float, as_json: bool) -> None:
-    """Print the machine and the parts of a training step, for one thread and for all, or everything as json."""
-    import torch
-
-    from mien.lab.benchmarking.step_parts import format_parts, parts_suite
-    from mien.lab.benchmarking.timing import format_machine, measure_machine
-
-    torch.set_num_threads(1)
-    machine, shown = measure_machine(), []
-    if not as_json:
-        show(format_machine(machine))
-    for rows in parts_suite(seconds):
-        shown += rows
-        if not as_json:
-            show(format_parts(rows))
-    if as_json:
-        show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
+TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
 def _gpu(name: DeviceName) -> "torch.Tensor | None":
@@ -282,8 +236,10 @@ def _gpu(name: DeviceName) -> "torch.Tensor | None":
     return like_on(device) if device.type == "cuda" else None
 
 
-def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) -> "list[BenchmarkRow]":
-    """Print the machine, and each row once it is measured, or everything as json. Torch uses one thread."""
+def show_rows(
+    rows: "Iterable[Any]", as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
+) -> "list[Any]":
+    """Print the machine, and each row (or list of rows) once it is measured, or everything as json, with one thread."""
     import torch
 
     from mien.lab.benchmarking.timing import format_machine, format_row, measure_machine
@@ -293,9 +249,9 @@ def show_rows(rows: "Iterator[BenchmarkRow]", as_json: bool, gpu: bool = False) 
     if not as_json:
         show(format_machine(machine))
     for row in rows:
-        shown.append(row)
+        shown += row if isinstance(row, list) else [row]
         if not as_json:
-            show(format_row(row))
+            show((as_text or format_row)(row))
     if as_json:
         show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
     return shown

@@ -9,10 +9,10 @@ import tyro
 
 from mien.avatar.settings import MethodConfig
 from mien.capture.settings import CaptureSettings
-from mien.commands.parsing.options import TrainOptions, check_viewer
+from mien.commands.train_options import TrainOptions
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.machine.progress import Overall
+from mien.pipeline.names import check_viewer
 from mien.tracking.settings import ScoringSettings, TrackingSettings
 from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 from mien.training.settings.splits import SPLITS
@@ -46,7 +46,7 @@ class Command:
     """Frames in overlay.mp4: all, every n-th, at most 120 (auto), or none."""
     view: bool = False
     """Show the avatar in a browser while it trains."""
-    options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
+    options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions.of)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
@@ -79,7 +79,7 @@ class Command:
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.machine.progress import say, whole_command
+        from mien.machine.progress import say
         from mien.pipeline.capture import check_camera_ids
         from mien.pipeline.create import name_next_commands, show_film
         from mien.pipeline.face_models import face_model_of
@@ -103,80 +103,68 @@ class Command:
             check_trained_videos(workspace.run_dir(run), names, workspace.sequence_names())
             for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
                 say(f"warning: {warning}")
-        with whole_command(self._overall(settings)):
-            self._run_stages(workspace, run, method, settings)
+        self._run_stages(workspace, run, method, settings)
         show_film(workspace, run)
         say(f"Done in {time.monotonic() - began:.0f} s.")
         name_next_commands(workspace, run)
 
-    def _overall(self, settings: TrainSettings) -> Overall:
-        """What is to be done, with expected times."""
-        from mien.pipeline.expected import count_captured, count_scored, expected_pieces
-        from mien.pipeline.names import sequence_names
-
-        frames, names = [count_captured(video, self.capture) for video in self.videos], []
-        if self.calibration is None:
-            names = sequence_names(self.videos, self.name)
-        else:
-            frames = [sum(frames)]  # the cameras of one sequence
-        scored = count_scored(frames, names, settings)
-        several = self.calibration is not None
-        alignment = self.alignment if self.aligns(several) else None
-        return Overall(expected_pieces(frames, scored, self.tracking, settings, self.overlay, alignment))
-
     def aligns(self, several_cameras: bool) -> bool:
         """Whether new trackings are aligned."""
         auto = not several_cameras and not PRESETS[self.options.preset].published
-        auto = auto and not self._too_short_to_align(self.options.settings().steps)
+        auto = auto and self.options.steps >= self.alignment.template_steps  # else the quick avatar is no quicker
         return self.alignment.when == "always" or (self.alignment.when == "auto" and auto)
-
-    def _too_short_to_align(self, steps: int) -> bool:
-        """Whether a run is shorter than the training of the quick avatar that frames are aligned to."""
-        return steps < self.alignment.template_steps
 
     def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
         from mien.evaluation.protocols import EvaluationSettings
-        from mien.machine.progress import say
-        from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
-        from mien.pipeline.capture import run_calibrated_capture_stage, run_capture_stage
+        from mien.machine.progress import stages
         from mien.pipeline.create import show_page
         from mien.pipeline.evaluate import run_evaluation_stage
-        from mien.pipeline.names import sequence_names
         from mien.pipeline.track import run_tracking_stage, show_trackings
         from mien.pipeline.train import run_training_stage
         from mien.training.settings import check_held_out
 
-        if self.calibration is None:
-            videos = zip(self.videos, sequence_names(self.videos, self.name), strict=True)
-            captured = [
-                part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)
-            ]
-        else:
-            captured = run_calibrated_capture_stage(workspace, self.videos, self.calibration, self.name, self.capture)
-        check_held_out(captured, settings)
-        trackings = run_tracking_stage(
-            workspace,
-            self.face_model,
-            self.tracking,
-            overlay=self.overlay,
-            preview=self.preview,
-            hold_out=settings.held_out_sequences if self.track_apart else (),
-            scoring=self.scoring,
-            show=False,
-        )
-        together = [name for name in captured if name in trackings]
-        one = one_camera(workspace, together)
-        if one and self.alignment.when == "auto" and self._too_short_to_align(settings.steps):
+        with stages("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out) as begin:
+            begin("capture")
+            captured = self._capture(workspace)
+            check_held_out(captured, settings)
+            begin("tracking")
+            apart = settings.held_out_sequences if self.track_apart else ()
+            trackings = run_tracking_stage(
+                workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview, hold_out=apart,
+                scoring=self.scoring, show=False,
+            )  # fmt: skip
+            together = [name for name in captured if name in trackings]
+            begin("alignment")
+            self._align(workspace, run, together, settings)
+            show_trackings(workspace, list(trackings), self.overlay)
+            begin("training")
+            run_training_stage(workspace, together, run, method, settings, self.view)
+            show_page(workspace, run)
+            if settings.holds_out:
+                begin("scoring")
+                # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
+                run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
+
+    def _capture(self, workspace: Workspace) -> list[str]:
+        """Capture the videos, and return the names of their sequences."""
+        from mien.pipeline.capture import run_calibrated_capture_stage, run_capture_stage
+        from mien.pipeline.names import sequence_names
+
+        if self.calibration is not None:
+            return run_calibrated_capture_stage(workspace, self.videos, self.calibration, self.name, self.capture)
+        videos = zip(self.videos, sequence_names(self.videos, self.name), strict=True)
+        return [part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)]
+
+    def _align(self, workspace: Workspace, run: str, names: list[str], settings: TrainSettings) -> None:
+        """Align new trackings, if the options say so. A run that goes on keeps its tracking."""
+        from mien.machine.progress import say
+        from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
+
+        one = one_camera(workspace, names)
+        if one and self.alignment.when == "auto" and settings.steps < self.alignment.template_steps:
             say(
                 f"frames are not aligned to a quick avatar, as --steps {settings.steps} is below its own "
                 f"{self.alignment.template_steps:,}; `--alignment.when always` aligns them"
             )
-        # A run that goes on keeps its tracking.
-        if self.aligns(not one) and not is_trained_on(workspace, run, together):
-            run_alignment_stage(workspace, together, self.alignment, settings, keep=True)
-        show_trackings(workspace, list(trackings), self.overlay)
-        run_training_stage(workspace, together, run, method, settings, self.view)
-        show_page(workspace, run)
-        if settings.holds_out:
-            # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all the rest of scoring.
-            run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
+        if self.aligns(not one) and not is_trained_on(workspace, run, names):
+            run_alignment_stage(workspace, names, self.alignment, settings, keep=True)

@@ -1,10 +1,10 @@
 """`mien demo`: the whole path on a synthetic head."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mien.commands.create import Command as Create
-from mien.commands.parsing.options import PresetName, TrainOptions
+from mien.commands.train_options import PresetName, TrainOptions
 from mien.errors import UserError
 
 _MAX_SECONDS = 600.0
@@ -23,22 +23,18 @@ class Command:
     """Number of optimiser steps. 0 means the preset's number."""
     seconds: float = 0.0
     """Length of the video in seconds. 0 means the default length."""
-    seed: int = 0
-    """Seed of the head and its motion. Another seed gives another head and another motion."""
 
     def check(self) -> None:
         """Check the options without heavy libraries."""
         from mien.disk.files import check_writable
 
-        TrainOptions(preset=self.preset, steps=self.steps).settings()
+        self._options().settings()
         if self.seconds and not 0 < self.seconds <= _MAX_SECONDS:
             raise UserError(f"--seconds {self.seconds:g}: give a number above 0, at most {_MAX_SECONDS:g}")
         check_writable(self.out, folder=True)
 
     def run(self) -> None:
         """Write the video unless it exists, then run `mien create` on it."""
-        from dataclasses import replace
-
         from mien.disk.locks import hold
         from mien.lab.synthetic.captures import write_synthetic_video
         from mien.lab.synthetic.recipe import RECIPES
@@ -46,11 +42,14 @@ class Command:
         recipe = RECIPES["demo"]
         if self.seconds:
             recipe = replace(recipe, seconds=self.seconds)
-        video = self.out / f"synthetic-{self.seed}-{recipe.seconds:g}s.mp4"
+        video = self.out / f"synthetic-0-{recipe.seconds:g}s.mp4"
         if not video.is_file():
             with hold(video):
-                write_synthetic_video(recipe, video, self.seed)
-        options = TrainOptions(preset=self.preset, steps=self.steps)
-        create = Create(videos=(video,), out=self.out, name=("synthetic",), options=options)
+                write_synthetic_video(recipe, video, seed=0)
+        create = Create(videos=(video,), out=self.out, name=("synthetic",), options=self._options())
         create.check()
         create.run()
+
+    def _options(self) -> TrainOptions:
+        options = TrainOptions.of(preset=self.preset)
+        return replace(options, steps=self.steps) if self.steps else options

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
-from mien.commands.parsing.help_text import Described
 from mien.datasets.layouts.layout import LAYOUTS, Layout, MatteKind, find_layout
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
@@ -85,9 +84,9 @@ class Command:
     elsewhere. With --format nersemble-benchmark, write the videos that the NeRSemble benchmark asks for.
     """
 
-    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), Described(_about_workspace)]
-    out: Annotated[Path, Described(_about_out)]
-    format: Annotated[str | None, Described(_about_format)] = None
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), _about_workspace]
+    out: Annotated[Path, _about_out]
+    format: Annotated[str | None, _about_format] = None
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one). For a capture: hold out what this run holds out."""
     set: tuple[str, ...] = ()

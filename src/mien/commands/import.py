@@ -6,7 +6,6 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.parsing.help_text import Described
 from mien.datasets.dataset import Dataset, Findings
 from mien.datasets.registry import find_dataset, known_datasets, recognised
 from mien.disk.workspace import Workspace, check_new_workspace
@@ -22,7 +21,7 @@ def _about_path() -> str:
 class Command:
     """Read the files of another program, and write its avatar as a run, or its sequences with their tracking."""
 
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH"), Described(_about_path)]
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH"), _about_path]
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Workspace folder to put the run or the sequences into. It is made if it is missing."""
     name: Annotated[str | None, tyro.conf.arg(name="run")] = None

@@ -13,9 +13,6 @@ class Command:
     json: bool = False
     """Print a list of objects for programs instead of a table."""
 
-    def check(self) -> None:
-        """Check nothing: there is nothing to check."""
-
     def run(self) -> None:
         """Print the list."""
         from mien.licences.facts import PARTS

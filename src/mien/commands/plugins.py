@@ -17,9 +17,6 @@ class Command:
     json: bool = False
     """Print an object for programs instead of a list."""
 
-    def check(self) -> None:
-        """Check nothing: there is nothing to check."""
-
     def run(self) -> None:
         """Print the list."""
         from mien.avatar.methods import METHODS, Method

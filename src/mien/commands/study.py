@@ -1,4 +1,4 @@
-"""`mien study`: people judge methods blind, beside the truth."""
+"""Let people judge runs blind, beside the truth."""
 
 import json
 from dataclasses import dataclass
@@ -135,23 +135,7 @@ class Tally:
             show(tally_text(content))
 
 
-@dataclass(frozen=True)
-class Command:
-    """Let people compare runs blind: `mien study make` writes the page, `mien study tally` counts the answers."""
-
-    what: Annotated[
-        Annotated[Make, tyro.conf.subcommand("make", prefix_name=False)]
-        | Annotated[Tally, tyro.conf.subcommand("tally", prefix_name=False)],
-        tyro.conf.arg(name=""),
-    ]
-
-    def check(self) -> None:
-        """Check the options of the chosen task."""
-        self.what.check()
-
-    def run(self) -> None:
-        """Run the chosen task."""
-        self.what.run()
+TASKS = {"make": Make, "tally": Tally}
 
 
 def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.parsing.options import TrainOptions, check_viewer
+from mien.commands.train_options import TrainOptions
 from mien.disk.workspace import open_workspace
+from mien.pipeline.names import check_viewer
 from mien.training.settings import check_held_out
 from mien.training.settings.splits import SPLITS, Recordings, fill_in
 
@@ -24,7 +25,7 @@ class Command:
     """Name of the run (default: the method's name)."""
     view: bool = False
     """Show the avatar in a browser while it trains."""
-    options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions)
+    options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions.of)
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""

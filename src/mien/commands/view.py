@@ -6,9 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from mien.commands.parsing.options import check_avatar, check_port, check_viewer
 from mien.errors import UserError
 from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.names import check_avatar, check_port, check_viewer
 
 _LOOPBACK = "127.0.0.1"
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.params import FaceParams
 from mien.machine.progress import say
+from mien.pipeline.track import tell_outdated_runs
 from mien.pipeline.train import read_together
 from mien.rotation import axis_angle_from_matrix
 from mien.tracking.files import read_tracking, write_tracking
@@ -47,18 +47,8 @@ def run_alignment_stage(
     """Align the tracked faces of some sequences to a quick avatar, and write the trackings again.
 
     What `mien track` left stays beside them, and every alignment starts from it. Trackings that are aligned with these
-    settings stay as they are.
-
-    Args:
-        workspace: The workspace.
-        names: Names of the sequences, which were tracked together.
-        settings: Settings of the alignment. Its `when` is not read.
-        training: Settings of the run that follows, which say what is held out.
-        keep: Whether trackings that are aligned with other settings stay, too, so that older runs can still be scored.
-
-    Raises:
-        BeingWrittenError: another process is writing one of the sequences.
-        UserError: as `mien.training.align`, or a tracking was changed in this moment.
+    settings stay as they are; with `keep`, others that are aligned stay, too, so that older runs can still be scored.
+    `training` says what the run that follows holds out.
     """
     loaded, face_model = read_together(workspace, names)
     fingerprint = _fingerprint(loaded, settings, training)
@@ -87,7 +77,7 @@ def run_alignment_stage(
         for sequence, face in zip(before, faces, strict=True):
             _write(sequence, face, aligned)
         remove_tree(folder)
-    _tell_outdated(workspace, names)
+    tell_outdated_runs(workspace, _read_trackings(workspace, names), "the tracking before its alignment")
 
 
 def one_camera(workspace: Workspace, names: list[str]) -> bool:
@@ -100,8 +90,11 @@ def is_trained_on(workspace: Workspace, run: str, names: list[str]) -> bool:
     run_dir = workspace.run_dir(run)
     if not (run_dir / "config.json").is_file():
         return False
-    trackings = {name: read_tracking(workspace.sequence_dir(name) / "tracking") for name in names}
-    return not outdated_sequences(run_dir, trackings)
+    return not outdated_sequences(run_dir, _read_trackings(workspace, names))
+
+
+def _read_trackings(workspace: Workspace, names: list[str]) -> dict[str, Tracking]:
+    return {name: read_tracking(workspace.sequence_dir(name) / "tracking") for name in names}
 
 
 def _folder(sequence: Sequence) -> Path:
@@ -167,16 +160,3 @@ def _fingerprint(sequences: list[Sequence], settings: AlignmentSettings, trainin
 def _aligned(tracking: Tracking) -> dict[str, Any]:
     found = tracking.settings.get(_KEY)
     return found if isinstance(found, dict) else {}
-
-
-def _tell_outdated(workspace: Workspace, names: list[str]) -> None:
-    outdated = []
-    for run in workspace.run_names():
-        with suppress(UserError):  # a damaged run is reported when it is used
-            if not is_trained_on(workspace, run, names):
-                outdated.append(run)
-    if outdated:
-        say(
-            f"Trained on the tracking before its alignment: {', '.join(outdated)}. Such a run can still be rendered, "
-            "but neither resumed nor scored; train again under another name (--run NAME), or delete its folder first"
-        )

@@ -2,7 +2,8 @@
 
 import difflib
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from mien.runtime.named import GAZE_NAMES, is_gaze, parts_of, presets_for, turne
 
 _MAX_ANGLE = 1.0
 """Largest angle of a joint in either direction, in radians."""
+_NUMBER = re.compile(r"-?\d*\.?\d+")
 
 
 @dataclass(frozen=True)
@@ -68,58 +70,46 @@ def assign(
 
 
 def _read(assignments: Sequence[str], settable: Settable) -> list[tuple[str, float]]:
-    values = []
+    values, limits = [], _limits(settable)
     for position, assignment in enumerate(assignments):
         name, equals, text = assignment.partition("=")
-        _check_name(name, settable, assignment)
+        if name not in limits:
+            raise UserError(f"--set {assignment}: no expression {name!r}; {_hint(name, settable, limits)}")
+        lower, upper, unit = limits[name]
         if not equals:
             apart = "".join(assignments[position + 1 : position + 2])
-            number = apart if _is_number(apart) else ""
+            number = apart if _NUMBER.fullmatch(apart) else ""
             raise UserError(f"--set {f'{name} {number}'.rstrip()}: write {name}={number or '0.6'}")
         try:
             value = float(text)
         except ValueError:
             raise UserError(f"--set {assignment}: {text!r} is not a number; write --set {name}=0.6") from None
-        _check_range(name, value, settable, assignment)
+        if lower == upper:
+            model = settable.face_model
+            raise UserError(f"--set {assignment}: {name} does nothing with the face model {model!r}; leave it out")
+        if math.isnan(value) or not lower <= value <= upper:
+            raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}{unit}")
         values.append((name, value))
     return values
 
 
-def _check_range(name: str, value: float, settable: Settable, assignment: str) -> None:
-    """Check the value of a name that the face has."""
-    lower, upper, unit = 0.0, 1.0, "the full expression"
-    if name in settable.angles:
-        if math.isnan(value) or abs(value) > _MAX_ANGLE:
-            raise UserError(f"--set {assignment}: {name} goes from -{_MAX_ANGLE:g} to {_MAX_ANGLE:g} radians")
-        return
-    if is_gaze(name, settable.joints):
-        unit = "30 degrees aside; up and down, lids stop the eye earlier"
-    elif name in settable.expressions:
-        lower, upper = (round(float(bound), 4) for bound in settable.bounds[settable.expressions.index(name)])
-        unit = settable.unit
-    if lower == upper:
-        model = settable.face_model
-        raise UserError(f"--set {assignment}: {name} does nothing with the face model {model!r}; leave it out")
-    if math.isnan(value) or not lower <= value <= upper:
-        raise UserError(f"--set {assignment}: {name} goes from {lower:g} to {upper:g}; 1 is {unit}")
+def _limits(settable: Settable) -> dict[str, tuple[float, float, str]]:
+    """The lowest and the highest value of each name, and the unit in words."""
+    full, gaze = "; 1 is the full expression", "; 1 is 30 degrees aside; up and down, lids stop the eye earlier"
+    limits = {face: (0.0, 1.0, full) for face in presets_for(settable.expressions, settable.joints)}
+    for name, (lower, upper) in zip(settable.expressions, settable.bounds, strict=True):
+        limits[name] = (round(float(lower), 4), round(float(upper), 4), f"; 1 is {settable.unit}")
+    limits |= {name: (0.0, 1.0, gaze) for name in GAZE_NAMES if is_gaze(name, settable.joints)}
+    return limits | {name: (-_MAX_ANGLE, _MAX_ANGLE, " radians") for name in settable.angles}
 
 
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
-def _check_name(name: str, settable: Settable, assignment: str) -> None:
-    names, angles, joints = settable.expressions, settable.angles, settable.joints
-    faces, gazes = presets_for(names, joints), [gaze for gaze in GAZE_NAMES if is_gaze(gaze, joints)]
-    if name in (*names, *angles, *faces, *gazes):
-        return
+def _hint(name: str, settable: Settable, known: Iterable[str]) -> str:
     # Compare in lower case, so that `jawopen` is as near to jawOpen as possible.
-    folded = {known.lower(): known for known in (*names, *angles, *faces, *gazes)}
+    folded = {each.lower(): each for each in known}
     near = [folded[match] for match in difflib.get_close_matches(name.lower(), folded, 3, 0.6)]
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    faces = presets_for(settable.expressions, settable.joints)
     whole = f"; whole faces: {', '.join(faces)}" if faces else ""
-    every = f"there are: {', '.join(names)}{whole}; and joint angles in radians: {', '.join(angles)}"
-    hint = f"did you mean {' or '.join(near)}?" if near else every
-    raise UserError(f"--set {assignment}: no expression {name!r}; {hint}")
+    names, angles = ", ".join(settable.expressions), ", ".join(settable.angles)
+    return f"there are: {names}{whole}; and joint angles in radians: {angles}"

@@ -29,7 +29,7 @@ from mien.training.settings import PRESETS, TrainSettings
 from mien.training.trainer import train
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
-_SCORED = EvaluationSettings(video_frames=0)
+_SCORED, _PRESET = EvaluationSettings(video_frames=0), PRESETS["standard"]
 FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
 """Least and largest number of steps of the first trial. Between them, it uses each training frame once."""
 _TRIAL_SHARE = 0.1
@@ -57,16 +57,13 @@ class CompareSettings:
     """What `mien bench compare` compares."""
 
     methods: tuple[str, ...]
-    preset: str
     budget: Budget
     split: Literal["blocks", "tail"]
     """Held-out frames of workspaces. Reference captures have their own."""
 
     def run_name(self, method: str) -> str:
         """The name of a method's run."""
-        parts = [COMPARED + method, self.budget.name]
-        parts += [] if self.preset == "standard" else [self.preset]
-        return "-".join(parts + ([] if self.split == "blocks" else [self.split]))
+        return "-".join([COMPARED + method, self.budget.name, *([] if self.split == "blocks" else [self.split])])
 
 
 @dataclass(frozen=True)
@@ -88,12 +85,7 @@ def run_compare_stage(
 ) -> None:
     """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
 
-    Args:
-        out: Folder for the tables, for trials, and for reference captures with their workspaces.
-        workspaces: Tracked workspaces. Their runs are called `settings.run_name(method)`.
-        captures: Names of reference captures, which are drawn, captured and tracked first.
-        settings: Methods and budget.
-        as_json: Whether the result is printed as json.
+    The captures are tracked workspaces, and reference captures, which are drawn, captured and tracked in OUT first.
     """
     references = [reference_named(name) for name in captures]
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
@@ -123,22 +115,22 @@ def of_workspace(workspace: Workspace, settings: CompareSettings) -> Subject:
     names = workspace.tracked_names()
     if not names:
         raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
-    held = replace(PRESETS[settings.preset].settings, split=settings.split)
+    held = replace(_PRESET.settings, split=settings.split)
     return Subject(workspace.root.resolve().name, workspace, names, held)
 
 
 def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> Subject:
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
-    held = reference_settings(reference, PRESETS[settings.preset].settings)
+    held = reference_settings(reference, _PRESET.settings)
     return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 
 
 def _row(subject: Subject, method: str, settings: CompareSettings, out: Path) -> MethodRow:
     """Train and score a method on a capture, unless that is done."""
-    workspace, run, preset = subject.workspace, settings.run_name(method), PRESETS[settings.preset]
-    run_dir, config = workspace.run_dir(run), preset.config(method)
-    own = replace(subject.settings, steps=preset.settings_of(method).steps)
+    workspace, run = subject.workspace, settings.run_name(method)
+    run_dir, config = workspace.run_dir(run), _PRESET.config(method)
+    own = replace(subject.settings, steps=_PRESET.settings_of(method).steps)
     own = replace(own, steps=steps_for(subject, config, own, settings.budget, out / "trials" / subject.name / run))
     run_training_stage(workspace, subject.sequences, run, config, own)
     metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)

@@ -20,6 +20,7 @@ from mien.render import rasterize
 from mien.render.closing import close_holes
 from mien.render.validation import drawable
 from mien.runtime.camera_paths import zoom_for_all
+from mien.training.footage.filmed import filmed_words, read_coverage
 from mien.training.run import read_run_config
 from mien.training.whole_head.soft_cut import shares_left
 
@@ -52,11 +53,7 @@ def posed_softly(avatar: Avatar) -> Callable[[FaceParams], Gaussians]:
 def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing: int = 0) -> UInt8[np.ndarray, "h w _"]:
     """The picture as RGB over the background, or as RGBA with straight colours.
 
-    Args:
-        options: What pictures look like.
-        gaussians: What is drawn.
-        camera: The camera.
-        closing: Pixels by which holes are closed (`close_holes`). Transparent pictures keep them.
+    Holes are closed by `closing` pixels (`close_holes`), but not in transparent pictures.
     """
     background = torch.tensor(options.color()).to(gaussians.means)
     with drawable("the avatar posed like this", "choose another pose or camera, or train it again"):
@@ -86,6 +83,14 @@ def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> Non
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
             "`mien train --background random` avoids that"
         )
+
+
+def tell_of_sides(run_dir: Path, avatar: Avatar) -> None:
+    """Say how far to each side the head was filmed, if that is known. Beyond, it is completed."""
+    covered = read_coverage(run_dir, avatar.face_model)
+    if covered is not None:
+        neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach()
+        say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
 
 
 def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:

@@ -28,14 +28,10 @@ def run_evaluation_stage(
     *,
     again: bool = True,
 ) -> dict[str, Any]:
-    """Evaluate a run on its held-out frames and on the motion of drivers; return the content of metrics.json.
+    """Evaluate a run on its held-out frames; return the content of metrics.json.
 
-    Args:
-        workspace: The workspace of the run.
-        run: Name of the run.
-        settings: What to compute; None for the defaults.
-        drivers: Workspaces or folders of sequences that drive the avatar as well.
-        again: Whether to score again what was scored with the same settings.
+    Drivers are workspaces or folders of sequences, which drive the avatar as well. Without `again`, what was scored
+    with the same settings is only read.
     """
     run_dir = workspace.run_dir(run)
     folders = run_sequences(workspace, run_dir)

@@ -55,11 +55,6 @@ def run_import_stage(
         retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
         resume: Whether sequences that are there already stay as they are. If not, they are an error.
         corrects_colors: Whether the colours of videos are corrected, if the dataset has such a correction.
-
-    Raises:
-        UserError: the files or the face model cannot be read, or the run or a sequence is there already or cannot be
-            written. Sequences before that one stay.
-        BeingWrittenError: another process is writing the run or the sequence.
     """
     run_dir = workspace.run_dir(run)
     if dataset.holds == "avatar":
@@ -147,14 +142,7 @@ def front_camera(avatar: Avatar) -> Camera:
 
 
 def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path) -> None:
-    """Capture the videos of a sequence into its folder, and write what else the dataset has beside it.
-
-    Args:
-        folder: The sequence's folder, which is missing.
-        footage: The videos and what is known of them.
-        dataset: The dataset that it comes from.
-        source: The place that it was read from.
-    """
+    """Capture the videos of a sequence into its missing folder, and write what else the dataset has beside it."""
     settings = CaptureSettings(stride=footage.stride)
     try:
         if footage.cameras is None:

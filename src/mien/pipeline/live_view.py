@@ -29,12 +29,7 @@ class LiveView:
     """Shows the avatar of a run in browsers, from its first steps to its end. Call it after each step."""
 
     def __init__(self, name: str, camera: Camera) -> None:
-        """Prepare the viewer, which starts at the first call.
-
-        Args:
-            name: What the page calls the avatar.
-            camera: A good first view.
-        """
+        """Prepare the viewer, which starts at the first call. The page has that name and that first view."""
         self._name, self._camera = name, camera
         self._folder = Path(tempfile.mkdtemp(prefix="mien-view-"))
         self._due = 0.0

@@ -1,5 +1,6 @@
-"""Names of sequences and runs, which become names of folders."""
+"""Checks of what people name, before any work: avatars, videos, sequences, runs, and what a viewer needs."""
 
+import importlib.util
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import combinations
@@ -7,7 +8,7 @@ from pathlib import Path
 
 from mien.disk.files import file_digest
 from mien.disk.inside import is_plain_name
-from mien.disk.workspace import check_no_workspace
+from mien.disk.workspace import check_no_workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.terminal import plain_name
 
@@ -120,3 +121,33 @@ def no_model_file(path: Path) -> str:
     if path.is_dir():
         return f"{path}: is a folder, and not ICT-FaceKit's FaceXModel; give a file in it: gnm_head.npz, {files}"
     return f"{path}: no such file; give {files}"
+
+
+def check_avatar(avatar: Path, run: str | None) -> None:
+    """Check that there is an avatar: a .mien file, or a run of a workspace."""
+    if avatar.is_file():
+        if run is not None:
+            raise UserError(f"--run {run}: a file holds one avatar; leave --run out")
+        if avatar.suffix.lower() != ".mien":
+            raise UserError(f"{avatar}: is no .mien file; give one, or a workspace's folder")
+    elif avatar.suffix.lower() == ".mien" and not avatar.exists():
+        raise UserError(f"{avatar}: no such file; write one with `mien export DIR --out me.mien`")
+    else:
+        open_workspace(avatar).pick_run(run)
+
+
+def check_port(port: int) -> None:
+    """Check the port of a viewer."""
+    if not 0 <= port <= 65_535:
+        raise UserError(f"--port {port}: give a number from 1 to 65535, or 0 for a free one")
+
+
+def has_viewer() -> bool:
+    """Whether the package of the viewer's page is installed."""
+    return importlib.util.find_spec("viser") is not None
+
+
+def check_viewer() -> None:
+    """Check that the package of the viewer's page is installed."""
+    if not has_viewer():
+        raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")

@@ -61,26 +61,21 @@ _SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
 _UNSEEN = ScoreSettings(perceptual_frames=2)
 
 
-def run_quality_stage(
-    out: Path, captures: tuple[str, ...], method: str, steps: int, *, aligned: bool, as_json: bool
-) -> None:
+def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
     """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png."""
-    references = [reference_named(name) for name in captures or _default_captures()]
+    usual = [name for name, reference in REFERENCES.items() if reference.by_default]
+    references = [reference_named(name) for name in captures or usual]
     method_named(method)
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        rows = _walk(references, out, method, steps, aligned)
+        rows = _walk(references, out, method, steps)
     show(json.dumps([asdict(row) for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
-def _default_captures() -> list[str]:
-    return [name for name, reference in REFERENCES.items() if reference.by_default]
-
-
-def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int, aligned: bool) -> list[QualityRow]:
+def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int) -> list[QualityRow]:
     rows, strips = [], []
     for reference in references:
-        row, strip = run_reference(reference, out, method, steps or reference.steps, aligned)
+        row, strip = run_reference(reference, out, method, steps or reference.steps)
         rows.append(row)
         strips.append(strip)
         content = {"rows": [asdict(row) for row in rows]}
@@ -90,12 +85,10 @@ def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int
     return rows
 
 
-def run_reference(
-    reference: ReferenceCapture, out: Path, method: str, steps: int, aligned: bool = True
-) -> tuple[QualityRow, np.ndarray]:
+def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
     """Run all stages on one reference capture and skip those with current results; return its row and its pictures.
 
-    With `aligned`, frames of one camera are aligned as `mien create` does.
+    Frames of one camera are aligned as `mien create` does.
     """
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     times = StageTimes(workspace.root / _TIMES)
@@ -104,7 +97,7 @@ def run_reference(
     run = f"{method}-{steps}"
     settings = reference_settings(reference, replace(PRESETS["standard"].settings_of(method), steps=steps))
     alignment = AlignmentSettings()
-    if aligned and steps >= alignment.template_steps and one_camera(workspace, list(trackings)):
+    if steps >= alignment.template_steps and one_camera(workspace, list(trackings)):
         with times.measured("align"):
             run_alignment_stage(workspace, list(trackings), alignment, settings, keep=True)
     with times.measured("train"):

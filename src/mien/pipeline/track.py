@@ -63,12 +63,7 @@ def run_tracking_stage(
     Current trackings are read back. The face model is a name or a file (`face_model_of`). Writes overlays and, only
     once, the scoring masks. Without `show`, reports and overlays are left to `show_trackings`. Sequences with too few
     faces are left out, unless that would leave none. Held-out sequences have no part in what the sequences share
-    (`track_subject`). No other process may write a sequence meanwhile, unless everything is current and nothing is
-    written.
-
-    Raises:
-        BeingWrittenError: another process is writing one of the sequences.
-        UserError: Among others, a sequence has masks with another cut than that of `scoring`.
+    (`track_subject`). No other process may write a sequence meanwhile, unless everything is current.
     """
     face_model = face_model_of(face_model_choice)
     names = workspace.sequence_names()
@@ -99,11 +94,7 @@ def run_tracking_stage(
 
 
 def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overlay) -> None:
-    """Write reports and overlays of some tracked sequences, as far as they are missing or outdated.
-
-    Raises:
-        BeingWrittenError: something is to be written, and another process is writing that sequence.
-    """
+    """Write reports and overlays of some tracked sequences, as far as they are missing or outdated."""
     folders = [workspace.sequence_dir(name) for name in names]
     lacking = [folder for folder in folders if not all(_is_shown(folder, read_tracking(folder / "tracking"), overlay))]
     with hold(*lacking):
@@ -258,11 +249,12 @@ def _track(
         write_tracking(folder / "tracking", trackings[name])
         (folder / OVERLAY).unlink(missing_ok=True)  # an import's, which shows another tracking
         say(f"{name}: tracked with a median landmark residual of {tracking.residuals.nanmedian():.2f} pixels")
-    _tell_outdated_runs(workspace, trackings)
+    tell_outdated_runs(workspace, trackings, "the previous tracking")
     return trackings
 
 
-def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking]) -> None:
+def tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking], before: str) -> None:
+    """Name the runs that were trained on other trackings of these sequences, those of `before`."""
     outdated = []
     for run in workspace.run_names():
         # A damaged run is reported when it is used.
@@ -271,7 +263,7 @@ def _tell_outdated_runs(workspace: Workspace, trackings: Mapping[str, Tracking])
                 outdated.append(run)
     if outdated:
         say(
-            f"Trained on the previous tracking: {', '.join(outdated)}. Such a run can still be rendered, but neither "
+            f"Trained on {before}: {', '.join(outdated)}. Such a run can still be rendered, but neither "
             "resumed nor scored; train again under another name (--run NAME), or delete its folder first"
         )
 

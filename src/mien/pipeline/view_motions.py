@@ -96,15 +96,7 @@ def switch_of_first_camera(session: Session, viewed: Viewed) -> CameraSwitch:
 def switch_of(
     session: Session, viewed: Viewed, name: CameraName, follow: FollowOptions, again: bool = True
 ) -> CameraSwitch:
-    """Return a switch that lets the avatar of a session follow a camera.
-
-    Args:
-        session: The session.
-        viewed: Its avatar.
-        name: The camera.
-        follow: How the avatar follows.
-        again: Whether a file starts again at its end.
-    """
+    """Return a switch that lets the avatar of a session follow a camera. With `again`, a file plays again and again."""
 
     def make() -> Follower:
         model, person = viewed.person()

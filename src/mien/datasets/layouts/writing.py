@@ -99,7 +99,7 @@ def _readme(filmed: Filmed, layout: Layout, written: Written) -> str:
         lines += [
             "",
             f"Score pictures of another program as mien's own ({SCORING}/truth has the held-out pictures over white):",
-            f"    mien evaluate --images PICTURES --truth {SCORING}/truth",
+            f"    mien evaluate images PICTURES {SCORING}/truth",
             "PICTURES is a folder of pictures over white, with the same names.",
         ]
     return "\n".join(lines) + "\n"

@@ -1,1 +1,0 @@
-"""Between tyro and the commands: options of settings, help, messages, and files of settings."""
