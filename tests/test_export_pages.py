@@ -16,11 +16,10 @@ from mien.avatar.baking import make_portable
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.formats.page import write_packed, write_page
-from mien.formats.shared.packed import unpacked
-from mien.formats.shared.rows import with_rows
+from mien.formats.page import PackedOptions, PageOptions, write_packed, write_page
+from mien.formats.shared.packed import unpacked, with_rows
 from mien.formats.shared.thinning import contributions
-from mien.formats.shared.webcam import OWN, POLICY, VERSION, find_webcam_files, own_model
+from mien.formats.shared.webcam import OWN, POLICY, VERSION, own_model, webcam_files
 from refusals import refuses
 from test_runtime import SIZE, new_avatar
 from toy_scene import toy_camera
@@ -69,19 +68,20 @@ def test_a_page_fits_with_those_that_add_most(tmp_path: Path) -> None:
     portable = drawn_head(4000)
     whole = write_page(tmp_path / "whole.html", portable)
     for largest in (whole.size, whole.size // 10 * 9):
-        page = write_page(tmp_path / "a.html", portable, largest=largest)
+        page = write_page(tmp_path / "a.html", portable, None, PageOptions(largest=largest / 1e6))
         assert page.size == (tmp_path / "a.html").stat().st_size <= largest
         assert page.size > 0.97 * largest
     assert page.count < whole.count == 4000
     assert page.psnr < whole.psnr
     with pytest.raises(UserError, match=r"b\.html: would have 0\.\d+ MB with the fewest Gaussians.*0\.01 MB at most"):
-        write_page(tmp_path / "b.html", drawn_head(500), largest=10_000)
+        write_page(tmp_path / "b.html", drawn_head(500), None, PageOptions(largest=0.01))
     assert not (tmp_path / "b.html").exists()
     # Half of the Gaussians are too faint to be seen: without them, the picture is the same.
     faint = np.random.default_rng(3).permutation(4000)[:2000]
     portable = with_faint(drawn_head(4000), faint)
     whole = write_packed(tmp_path / "whole.packed", portable)
-    packed = write_packed(tmp_path / "a.packed", portable, largest=round(0.9 * whole.size))
+    options = PackedOptions(largest=0.9 * whole.size / 1e6)
+    packed = write_packed(tmp_path / "a.packed", portable, None, options)
     assert 2000 <= packed.count < 4000
     assert packed.psnr == pytest.approx(whole.psnr, abs=1)
     shown = np.setdiff1d(np.arange(4000), faint)
@@ -160,11 +160,11 @@ def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
     compressed = package / "vision_wasm_internal.wasm.xz"
     compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
     wasm.unlink()
-    assert find_webcam_files().package == package, "its content has the right hash"
+    assert webcam_files()["wasm"], "its content has the right hash"
     cut = compressed.read_bytes()[:-100]
     for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
         compressed.write_bytes(content)
-        refuses(told, find_webcam_files)
+        refuses(told, webcam_files)
 
 
 def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monkeypatch, capsys, tmp_path) -> None:
@@ -178,7 +178,7 @@ def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monke
     told = refused(page, capsys)
     assert "mien's source distribution leaves out" in told
     assert "--webcam-model" in told
-    assert find_webcam_files(model).model == model
+    assert webcam_files(model)["model"] == model.read_bytes()
     model.write_bytes(b"")
     assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
     model.unlink()
@@ -197,7 +197,7 @@ def package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 def test_a_missing_or_other_package_is_explained(page: Path, package: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Versions after the pinned one send statistics to their maker, so files are known by their hash."""
-    assert find_webcam_files().package == package
+    assert len(webcam_files()) == 4
     with (package / "vision_bundle.cjs").open("a") as file:
         file.write("// newer")
     assert f"is not that of version {VERSION} of @mediapipe/tasks-vision" in refused(page, capsys)

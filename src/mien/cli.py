@@ -26,7 +26,7 @@ from mien.plugins import missing_package
 
 GROUPS = {
     "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),
-    "Use it": ("view", "render", "drive", "export"),
+    "Use it": ("view", "render", "drive", "export", "export-dataset"),
     "Research": ("evaluate", "analyze", "study", "bench", "face-models", "licenses", "plugins"),
 }
 """The sub-commands as `mien --help` lists them."""
@@ -43,6 +43,7 @@ COMMANDS = {
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
     "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
+    "export-dataset": "capture -> the layout of another laboratory, or the videos of the NeRSemble benchmark",
     "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
     "batch": "a table of captures -> an avatar each, here, on Slurm or on Ray",
     "face-models": "list the face models and bake them ahead of time",
@@ -158,32 +159,33 @@ def _run(name: str, rest: list[str]) -> int:
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
+    kind = module.command_for(rest) if hasattr(module, "command_for") else module.Command
     rest, for_all = _for_all_rows(name, rest)
-    for option in list_options(module.Command):
+    for option in list_options(kind):
         if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:
             # The first of its values would be dropped without a word.
             raise UserError(f"{option} is given twice; give it once, followed by all of its values")
-    options, more = module.Command, ""
+    options, more = kind, ""
     if "--help-all" in rest:
         rest = ["--help" if argument == "--help-all" else argument for argument in rest]
-        options = readable(with_settings(module.Command, rest))
+        options = readable(with_settings(kind, rest))
     elif "-h" in rest or "--help" in rest:
-        options, groups = without_details(module.Command)
-        glance = at_a_glance(module.Command, name)
+        options, groups = without_details(kind)
+        glance = at_a_glance(kind, name)
         options = readable(glance or options)
-        further, words = settings_groups(module.Command, rest)
+        further, words = settings_groups(kind, rest)
         names = ", ".join(f"--{group}.*" for group in groups + further)
         names += ", and others" if glance is not None else ""
         more = f"More options ({names}): mien {name}{words} --help-all" if names else ""
     else:
-        options = with_settings(module.Command, rest)
+        options = with_settings(kind, rest)
     complaints, style = io.StringIO(), (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     try:
         with contextlib.redirect_stderr(complaints):
             command = tyro.cli(
                 options,
                 prog=f"mien {name}",
-                description=inspect.getdoc(module.Command),
+                description=inspect.getdoc(kind),
                 args=rest,
                 config=style,
             )

@@ -53,7 +53,7 @@ def with_benchmark_split(
         raise UserError(
             f"--split {BENCHMARK_SPLIT}: there is no test sequence (FREE, EMO-1, SEN-09, SEN-10) and no camera "
             f"{', '.join(HIDDEN_CAMERAS)} to hold out, because the benchmark publishes none; train with --split none, "
-            "and write the submission with `mien export --format nersemble-benchmark`"
+            "and write the submission with `mien export-dataset --format nersemble-benchmark`"
         )
     _check_own("--hold-out", settings.held_out_sequences, tests)
     _check_own("--hold-out-cameras", settings.held_out_cameras, cameras)
