@@ -3,10 +3,11 @@
 This file needs no torch, because the command line lists the formats and checks options against them.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal
 
 from mien.errors import UserError
 
@@ -23,42 +24,41 @@ Holds = Literal["pose", "sequence", "avatar", "folder"]
 """What a file of a format holds: Gaussians in one pose, or in many, a whole avatar, or a folder with a whole run."""
 
 
-@runtime_checkable
-class Content(Protocol):
+class Content(ABC):
     """An avatar that is written. A format asks for what it holds, and nothing else is computed."""
 
     @property
+    @abstractmethod
     def count(self) -> int:
         """Number of Gaussians."""
-        ...
 
+    @abstractmethod
     def portable(self, confidence: bool = True, soft_cut: bool = False) -> "mien.runtime.baked.PortableAvatar":
         """Return the whole avatar.
 
         `confidence` asks for what was filmed of each triangle, if that is known, and `soft_cut` for a head that fades
         towards its neck cut.
         """
-        ...
 
-    def mesh(self) -> "mien.formats.glb.MeshModel":
-        """Return the person's mesh with its texture coordinates. Avatars that come from a file have none."""
-        ...
-
+    @abstractmethod
     def pose(self) -> "mien.gaussians.Gaussians":
         """Return the Gaussians with the expression that was asked for: the head at the origin, +y up, +z ahead."""
-        ...
 
     def poses(self) -> "tuple[Iterator[Content], float] | None":
         """Return the content in the pose of each frame of the motion, and frames per second; None without a motion."""
-        ...
+        return None
 
     def motion(self) -> "mien.formats.shared.packed.Motion | None":
-        """Return the motion that was asked for, as face parameters with head poses."""
-        ...
+        """Return the motion that was asked for, as face parameters with head poses; None without one."""
+        return None
+
+    def mesh(self) -> "mien.formats.glb.MeshModel":
+        """Return the person's mesh with its texture coordinates, which only a run has."""
+        raise UserError("a file does not have all that this format needs; export its workspace")
 
     def trained(self) -> "tuple[mien.avatar.avatar.Avatar, mien.face.params.FaceParams]":
-        """Return the trained avatar, and the person at all timesteps of its training."""
-        ...
+        """Return the trained avatar, and the person at all timesteps of its training, which only a run has."""
+        raise UserError("a file does not have all that this format needs; export its workspace")
 
 
 @dataclass(frozen=True)

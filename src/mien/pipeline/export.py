@@ -2,10 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from mien import runtime
-from mien.errors import UserError
 from mien.formats.format import Content, Format, NoOptions
 from mien.formats.registry import format_of, numbered
 from mien.machine.progress import say
@@ -31,7 +30,7 @@ def export(content: Content, out: Path, kind: Format, options: NoOptions) -> Non
     say(f"{written[0]} ... {written[-1].name}: {len(written)} files")
 
 
-class FileContent:
+class FileContent(Content):
     """An avatar that comes from a file, at rest, as `mien.formats.Content`."""
 
     def __init__(self, source: Path):
@@ -39,7 +38,7 @@ class FileContent:
         kind = format_of(source)
         assert kind is not None
         assert kind.read is not None
-        self._source, self._avatar = source, kind.read(source)
+        self._avatar = kind.read(source)
 
     @property
     def count(self) -> int:
@@ -49,10 +48,6 @@ class FileContent:
     def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
         """Return the avatar as it was read."""
         return self._avatar
-
-    def mesh(self) -> NoReturn:
-        """Refuse: texture coordinates are only in a run."""
-        self.trained()
 
     def pose(self) -> "mien.gaussians.Gaussians":
         """Return the Gaussians. This needs torch."""
@@ -65,16 +60,6 @@ class FileContent:
         pose = None if posed.T_world_local is None else torch.from_numpy(posed.T_world_local)
         still = gaussians_of((posed.means, posed.quats, posed.scales, posed.opacities, posed.sh))
         return in_world(replace(still, T_world_local=pose))
-
-    def poses(self) -> None:
-        """Return None: there is no motion."""
-
-    def motion(self) -> None:
-        """Return None: there is no motion."""
-
-    def trained(self) -> NoReturn:
-        """Refuse: what was trained is only in a run."""
-        raise UserError(f"{self._source}: a file does not have all that this format needs; export its workspace")
 
     def _posed(self) -> runtime.Gaussians:
         """The Gaussians with the head at the origin."""

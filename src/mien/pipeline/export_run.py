@@ -14,7 +14,7 @@ from mien.disk.workspace import Workspace
 from mien.driving.rest import facing, rest_of
 from mien.driving.transfer import drive
 from mien.face.params import FaceParams
-from mien.formats.format import MotionOptions, NoOptions, PoseOptions
+from mien.formats.format import Content, MotionOptions, NoOptions, PoseOptions
 from mien.formats.glb import MeshModel
 from mien.formats.shared.packed import Motion
 from mien.formats.shared.world_space import in_world
@@ -28,8 +28,8 @@ from mien.training.run import read_face_track, run_camera
 from mien.training.whole_head.soft_cut import with_soft_cut
 
 
-class RunContent:
-    """The avatar of a run, as `mien.formats.Content`."""
+class RunContent(Content):
+    """The avatar of a run."""
 
     def __init__(self, workspace: Workspace, run: str, options: NoOptions | None = None):
         """Load the avatar. The options name its pose, and what moves it."""

@@ -31,7 +31,6 @@ _PER_FRAME = {"expr": None, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_
 _WANTED = (*_PER_FRAME, "shape", "static_offset", "dynamic_offset")
 TEETH = (5023, 5143)
 """Vertices of FLAME, without and with the teeth that GaussianAvatars adds. Trackings may lack offsets of the teeth."""
-_MAX_TIMESTEPS = 1_000_000
 _REMEDY = "give flame_param.npz as GaussianAvatars or `mien export` wrote it"
 
 
@@ -118,7 +117,7 @@ def _checked(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarr
         if not is_moderate(array):
             raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {_REMEDY}")
     t = len(arrays["expr"]) if arrays["expr"].ndim == 2 else 0
-    if not 0 < t <= _MAX_TIMESTEPS:
+    if not 0 < t <= 1_000_000:
         raise UserError(f"{path}: 'expr' has the shape {list(arrays['expr'].shape)}, not [timesteps, n]; {_REMEDY}")
     for name, columns in _PER_FRAME.items():
         wanted = [t, columns or arrays["expr"].shape[1]]
