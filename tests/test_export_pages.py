@@ -117,13 +117,6 @@ def exported(page: Path, *more: str) -> int:
     return main(["export", str(page.with_name("me.mien")), "--out", str(page), *more])
 
 
-def refused(page: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
-    capsys.readouterr()
-    assert exported(page, "--webcam", *more) == 2
-    assert not page.exists()
-    return capsys.readouterr().err
-
-
 @pytest.mark.unchecked
 def test_the_command_needs_nothing_but_what_comes_with_mien(page: Path, monkeypatch, test_data: Path) -> None:
     """A page with a webcam has the same bytes each time, and a page without one has nothing of it."""
@@ -154,20 +147,7 @@ def test_the_model_is_the_published_one_and_one_version_is_pinned() -> None:
     assert f"@mediapipe/tasks-vision@{VERSION}\n" in (WEB.parent / "Makefile").read_text()
 
 
-def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
-    """In mien's own folder, the largest file lies compressed."""
-    (wasm,) = package.rglob("vision_wasm_internal.wasm")
-    compressed = package / "vision_wasm_internal.wasm.xz"
-    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
-    wasm.unlink()
-    assert webcam_files()["wasm"], "its content has the right hash"
-    cut = compressed.read_bytes()[:-100]
-    for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
-        compressed.write_bytes(content)
-        refuses(told, webcam_files)
-
-
-def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monkeypatch, capsys, tmp_path) -> None:
+def test_a_wrong_model_and_one_without_its_second_part_are_explained(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """mien from a source distribution lacks the network for blend shapes. A model that is given serves."""
     monkeypatch.setenv("MIEN_TASKS_VISION", str(tasks_vision()))
     monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
@@ -175,33 +155,33 @@ def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monke
     model.write_bytes(own_model())
     shutil.copy(OWN / "face_landmarker.task.xz.1", tmp_path)
     monkeypatch.setattr("mien.formats.shared.webcam.OWN", tmp_path)
-    told = refused(page, capsys)
-    assert "mien's source distribution leaves out" in told
-    assert "--webcam-model" in told
+    refuses("mien's source distribution leaves out.*--webcam-model", webcam_files)
     assert webcam_files(model)["model"] == model.read_bytes()
-    model.write_bytes(b"")
-    assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
-    model.unlink()
-    monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))
-    assert f"{model}: no such file; give MediaPipe's face landmarker" in refused(page, capsys)
+    monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(tmp_path / "gone"))
+    refuses("gone: no such file; give MediaPipe's face landmarker", webcam_files)
     for content in (b"", b"PK\x03\x04 no archive"):
         model.write_bytes(content)
-        assert "is no face_landmarker.task with blend shapes" in refused(page, capsys)
+        told = refuses("is no face_landmarker.task with blend shapes", webcam_files, model)
+        assert "mien has one" not in told
 
 
-@pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.setenv("MIEN_TASKS_VISION", str(tmp_path / "package"))
-    return Path(shutil.copytree(tasks_vision(), tmp_path / "package"))
-
-
-def test_a_missing_or_other_package_is_explained(page: Path, package: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Versions after the pinned one send statistics to their maker, so files are known by their hash."""
-    assert len(webcam_files()) == 4
-    with (package / "vision_bundle.cjs").open("a") as file:
-        file.write("// newer")
-    assert f"is not that of version {VERSION} of @mediapipe/tasks-vision" in refused(page, capsys)
-    shutil.rmtree(package)
-    told = refused(page, capsys)
-    for part in ("needs vision_bundle.cjs", "make landmarker", f"@mediapipe/tasks-vision@{VERSION}"):
-        assert part in told
+def test_a_missing_or_other_package_is_explained(page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path, capsys) -> None:
+    """Versions after the pinned one send statistics to their maker, so files are known by their hash. In mien's own
+    folder, the largest file lies compressed."""
+    package = Path(shutil.copytree(tasks_vision(), tmp_path / "package"))
+    monkeypatch.setenv("MIEN_TASKS_VISION", str(package))
+    (wasm,) = package.rglob("vision_wasm_internal.wasm")
+    compressed = package / "vision_wasm_internal.wasm.xz"
+    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
+    content = webcam_files()["wasm"]
+    wasm.unlink()
+    assert webcam_files()["wasm"] == content
+    for damaged, told in (
+        (compressed.read_bytes()[:-100], f"is not that of version {VERSION} of @mediapipe/tasks-vision"),
+        (b"no archive", "--webcam needs vision_wasm_internal.wasm.*make landmarker.*@mediapipe/tasks-vision@"),
+    ):
+        compressed.write_bytes(damaged)
+        refuses(told, webcam_files)
+    assert exported(page, "--webcam") == 2
+    assert "needs vision_wasm_internal.wasm" in capsys.readouterr().err
+    assert not page.exists()

@@ -70,8 +70,10 @@ class Command:
         if self._is_file():
             export(FileContent(self.workspace), self.out, kind, self.options)
             return
+        from mien.machine.progress import say
         from mien.pipeline.export_run import RunContent
 
+        say(f"{self.out}: reads the run and writes the file, which takes up to half a minute")
         workspace = open_workspace(self.workspace)
         export(RunContent(workspace, workspace.pick_run(self.run_name), self.options), self.out, kind, self.options)
 

@@ -18,7 +18,6 @@ def export(content: Content, out: Path, kind: Format, options: NoOptions) -> Non
     """Write an avatar in a format, and tell of it. A motion is numbered files if a file holds one pose."""
     frames = content.poses() if kind.holds == "pose" else None
     if frames is None:
-        say(f"{out}: reads the avatar and writes the file, which takes up to half a minute")
         first, *notes = kind.write(out, content, options).splitlines()
         for line in (f"{out}: {first}", *notes):
             say(line)
