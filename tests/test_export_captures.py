@@ -272,17 +272,16 @@ def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch
 
     def refused(message: str, *options: str) -> None:
         capsys.readouterr()
-        assert main(["export", str(workspace), "--out", str(out), *options]) == 2
+        assert main(["export-dataset", str(workspace), "--out", str(out), *options]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert message in line
 
-    refused("--set: is for avatars, and --format insta writes a capture", "--format", "insta", "--set", "smile=1")
-    refused("--split tail: is for captures", "--format", "ply", "--split", "tail", "--out", "a.ply")
-    refused("or insta, imavatar, nerface or nersemble for a capture", "--format", "inst")
+    refused("--benchmark is an option of --format nersemble-benchmark", "--format", "insta", "--benchmark", "393")
+    refused("choose insta, imavatar, nerface, nersemble or nersemble-benchmark", "--format", "inst")
     refused("there is no run yet", "--format", "insta", "--run", "me")
     refused("no sequence 'other'", "--format", "insta", "--sequence", "other")
     refused("--split dataset: the sequence clip has no split", "--format", "insta", "--split", "dataset")
-    assert main(["export", str(workspace), "--out", str(out), "--format", "insta", "--split", "tail"]) == 0
+    assert main(["export-dataset", str(workspace), "--out", str(out), "--format", "insta", "--split", "tail"]) == 0
     assert f"{out}: 10 training frames, 2 held out; see README.txt" in capsys.readouterr().err
     (sequence,) = read(out, "insta", scene.model)
     assert sequence.own_split.timesteps == ((10, 12),)

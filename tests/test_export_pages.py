@@ -16,11 +16,10 @@ from mien.avatar.baking import make_portable
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.errors import UserError
-from mien.formats.page import write_packed, write_page
-from mien.formats.shared.packed import unpacked
-from mien.formats.shared.rows import with_rows
+from mien.formats.page import PackedOptions, PageOptions, write_packed, write_page
+from mien.formats.shared.packed import unpacked, with_rows
 from mien.formats.shared.thinning import contributions
-from mien.formats.shared.webcam import OWN, POLICY, VERSION, find_webcam_files, own_model
+from mien.formats.shared.webcam import OWN, POLICY, VERSION, own_model, webcam_files
 from refusals import refuses
 from test_runtime import SIZE, new_avatar
 from toy_scene import toy_camera
@@ -69,19 +68,20 @@ def test_a_page_fits_with_those_that_add_most(tmp_path: Path) -> None:
     portable = drawn_head(4000)
     whole = write_page(tmp_path / "whole.html", portable)
     for largest in (whole.size, whole.size // 10 * 9):
-        page = write_page(tmp_path / "a.html", portable, largest=largest)
+        page = write_page(tmp_path / "a.html", portable, None, PageOptions(largest=largest / 1e6))
         assert page.size == (tmp_path / "a.html").stat().st_size <= largest
         assert page.size > 0.97 * largest
     assert page.count < whole.count == 4000
     assert page.psnr < whole.psnr
     with pytest.raises(UserError, match=r"b\.html: would have 0\.\d+ MB with the fewest Gaussians.*0\.01 MB at most"):
-        write_page(tmp_path / "b.html", drawn_head(500), largest=10_000)
+        write_page(tmp_path / "b.html", drawn_head(500), None, PageOptions(largest=0.01))
     assert not (tmp_path / "b.html").exists()
     # Half of the Gaussians are too faint to be seen: without them, the picture is the same.
     faint = np.random.default_rng(3).permutation(4000)[:2000]
     portable = with_faint(drawn_head(4000), faint)
     whole = write_packed(tmp_path / "whole.packed", portable)
-    packed = write_packed(tmp_path / "a.packed", portable, largest=round(0.9 * whole.size))
+    options = PackedOptions(largest=0.9 * whole.size / 1e6)
+    packed = write_packed(tmp_path / "a.packed", portable, None, options)
     assert 2000 <= packed.count < 4000
     assert packed.psnr == pytest.approx(whole.psnr, abs=1)
     shown = np.setdiff1d(np.arange(4000), faint)
@@ -117,13 +117,6 @@ def exported(page: Path, *more: str) -> int:
     return main(["export", str(page.with_name("me.mien")), "--out", str(page), *more])
 
 
-def refused(page: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
-    capsys.readouterr()
-    assert exported(page, "--webcam", *more) == 2
-    assert not page.exists()
-    return capsys.readouterr().err
-
-
 @pytest.mark.unchecked
 def test_the_command_needs_nothing_but_what_comes_with_mien(page: Path, monkeypatch, test_data: Path) -> None:
     """A page with a webcam has the same bytes each time, and a page without one has nothing of it."""
@@ -154,20 +147,7 @@ def test_the_model_is_the_published_one_and_one_version_is_pinned() -> None:
     assert f"@mediapipe/tasks-vision@{VERSION}\n" in (WEB.parent / "Makefile").read_text()
 
 
-def test_a_compressed_file_of_the_package_is_that_file(package: Path) -> None:
-    """In mien's own folder, the largest file lies compressed."""
-    (wasm,) = package.rglob("vision_wasm_internal.wasm")
-    compressed = package / "vision_wasm_internal.wasm.xz"
-    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
-    wasm.unlink()
-    assert find_webcam_files().package == package, "its content has the right hash"
-    cut = compressed.read_bytes()[:-100]
-    for content, told in ((cut, "is not that of version"), (b"no archive", "--webcam needs vision_wasm_internal.wasm")):
-        compressed.write_bytes(content)
-        refuses(told, find_webcam_files)
-
-
-def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monkeypatch, capsys, tmp_path) -> None:
+def test_a_wrong_model_and_one_without_its_second_part_are_explained(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """mien from a source distribution lacks the network for blend shapes. A model that is given serves."""
     monkeypatch.setenv("MIEN_TASKS_VISION", str(tasks_vision()))
     monkeypatch.delenv("MIEN_FACE_LANDMARKER", raising=False)
@@ -175,33 +155,33 @@ def test_a_wrong_model_and_one_without_its_second_part_are_explained(page, monke
     model.write_bytes(own_model())
     shutil.copy(OWN / "face_landmarker.task.xz.1", tmp_path)
     monkeypatch.setattr("mien.formats.shared.webcam.OWN", tmp_path)
-    told = refused(page, capsys)
-    assert "mien's source distribution leaves out" in told
-    assert "--webcam-model" in told
-    assert find_webcam_files(model).model == model
-    model.write_bytes(b"")
-    assert "mien has one" not in refused(page, capsys, "--webcam-model", str(model))
-    model.unlink()
-    monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(model))
-    assert f"{model}: no such file; give MediaPipe's face landmarker" in refused(page, capsys)
+    refuses("mien's source distribution leaves out.*--webcam-model", webcam_files)
+    assert webcam_files(model)["model"] == model.read_bytes()
+    monkeypatch.setenv("MIEN_FACE_LANDMARKER", str(tmp_path / "gone"))
+    refuses("gone: no such file; give MediaPipe's face landmarker", webcam_files)
     for content in (b"", b"PK\x03\x04 no archive"):
         model.write_bytes(content)
-        assert "is no face_landmarker.task with blend shapes" in refused(page, capsys)
+        told = refuses("is no face_landmarker.task with blend shapes", webcam_files, model)
+        assert "mien has one" not in told
 
 
-@pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.setenv("MIEN_TASKS_VISION", str(tmp_path / "package"))
-    return Path(shutil.copytree(tasks_vision(), tmp_path / "package"))
-
-
-def test_a_missing_or_other_package_is_explained(page: Path, package: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Versions after the pinned one send statistics to their maker, so files are known by their hash."""
-    assert find_webcam_files().package == package
-    with (package / "vision_bundle.cjs").open("a") as file:
-        file.write("// newer")
-    assert f"is not that of version {VERSION} of @mediapipe/tasks-vision" in refused(page, capsys)
-    shutil.rmtree(package)
-    told = refused(page, capsys)
-    for part in ("needs vision_bundle.cjs", "make landmarker", f"@mediapipe/tasks-vision@{VERSION}"):
-        assert part in told
+def test_a_missing_or_other_package_is_explained(page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path, capsys) -> None:
+    """Versions after the pinned one send statistics to their maker, so files are known by their hash. In mien's own
+    folder, the largest file lies compressed."""
+    package = Path(shutil.copytree(tasks_vision(), tmp_path / "package"))
+    monkeypatch.setenv("MIEN_TASKS_VISION", str(package))
+    (wasm,) = package.rglob("vision_wasm_internal.wasm")
+    compressed = package / "vision_wasm_internal.wasm.xz"
+    compressed.write_bytes(lzma.compress(wasm.read_bytes(), preset=0))
+    content = webcam_files()["wasm"]
+    wasm.unlink()
+    assert webcam_files()["wasm"] == content
+    for damaged, told in (
+        (compressed.read_bytes()[:-100], f"is not that of version {VERSION} of @mediapipe/tasks-vision"),
+        (b"no archive", "--webcam needs vision_wasm_internal.wasm.*make landmarker.*@mediapipe/tasks-vision@"),
+    ):
+        compressed.write_bytes(damaged)
+        refuses(told, webcam_files)
+    assert exported(page, "--webcam") == 2
+    assert "needs vision_wasm_internal.wasm" in capsys.readouterr().err
+    assert not page.exists()

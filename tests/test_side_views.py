@@ -22,7 +22,7 @@ from mien.formats.page import write_packed
 from mien.gaussians import world_means
 from mien.pipeline import draw as pictures
 from mien.pipeline.draw import posed_softly
-from mien.pipeline.export import RunContent
+from mien.pipeline.export_run import RunContent
 from mien.pipeline.picture_options import PictureOptions
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle

@@ -19,13 +19,16 @@ import torch
 import zstandard
 
 from mien import runtime
+from mien.camera import camera_from_fov
 from mien.cli import main
 from mien.errors import UserError
 from mien.formats import in_world, read_ply, write_ply
+from mien.formats.shared.world_space import with_y_down
 from mien.formats.sog import cells_of, read_sog, write_sog
 from mien.formats.spz import read_spz, write_spz
 from mien.formats.usd import read_usd, write_usd
 from mien.gaussians import Gaussians
+from mien.render import rasterize
 from mien.rotation import multiply_quaternions
 from needs import NO_PACKAGE, NO_SPLAT_TRANSFORM
 from refusals import refuses
@@ -109,6 +112,35 @@ def test_round_trip(tmp_path: Path, coefficients: int, ending: str, read, loss: 
     assert a.read_bytes() == b.read_bytes()
     WRITERS[ending](b, written.select(torch.zeros(1000, dtype=torch.bool)))
     assert len(read(b)) == 0
+
+
+@pytest.mark.parametrize("coefficients", [1, 16])
+def test_half_a_turn_for_viewers_with_y_down_is_exact(coefficients: int) -> None:
+    """A camera that turns as well sees the same picture, and the second half turn gives the same numbers."""
+    gaussians, turn = some(80, coefficients), HALF_TURN
+    turned = with_y_down(gaussians)
+    assert torch.equal(turned.means, gaussians.means @ turn[:3, :3])
+    again = with_y_down(turned)
+    for name in ("means", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(again, name), getattr(gaussians, name))
+    assert torch.equal(again.quats, -gaussians.quats), "the same rotation"
+    viewmat = HALF_TURN.clone()
+    viewmat[2, 3] = 0.6
+    camera = camera_from_fov(0.6, 48, 40, viewmat)
+    pairs = ((gaussians, camera), (turned, replace(camera, viewmat=viewmat @ turn)))
+    with torch.no_grad():
+        pictures = [rasterize(*pair, torch.ones(3), backend="reference").image for pair in pairs]
+    assert float(pictures[0].std()) > 0.05
+    torch.testing.assert_close(*pictures, atol=1e-5, rtol=0)
+
+
+def test_the_command_turns_files_for_such_viewers(tmp_path: Path, made_once: MadeOnce) -> None:
+    for ending, read in ((".ply", read_ply), (".sog", read_sog)):
+        for name, *options in (("up",), ("down", "--y-down")):
+            line = ["export", str(toy_workspace(made_once)), "--out", str(tmp_path / f"{name}{ending}"), *options]
+            assert main(line) == 0
+        up, down = (read(tmp_path / f"{name}{ending}").means for name in ("up", "down"))
+        torch.testing.assert_close(down, up * torch.tensor([1, -1, -1]), atol=1e-5, rtol=0)
 
 
 QUATS_IN_SPZ = {

@@ -16,8 +16,7 @@ from mien.avatar.baking import make_portable
 from mien.formats import page as web_page
 from mien.formats.page import write_page
 from mien.formats.shared import webcam
-from mien.formats.shared.bound_features import bound_features
-from mien.formats.shared.packed import pack
+from mien.formats.shared.packed import bound_features, pack
 from mien.runtime.baked import AttributeNetwork, FeatureDirections, LinearBases
 from refusals import refuses
 from test_runtime import new_avatar

@@ -12,7 +12,7 @@ import pytest
 import web_case as web
 from mien import runtime
 from mien.cli import main
-from mien.formats.page import POSTER, Described, check_address, write_packed, write_page
+from mien.formats.page import POSTER, PageOptions, write_packed, write_page
 from needs import NO_WEBGPU
 from refusals import refuses
 from test_web import REST, SHOW, SLIDE, WHITE, points, posing, skinned_head
@@ -181,8 +181,8 @@ def test_a_head_fills_a_phone_and_is_whole(portable: runtime.PortableAvatar, tmp
 
 
 def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.PortableAvatar) -> None:
-    described = Described('Ada & "Bo"', "https://example.org/heads/a.html")
-    write_page(tmp_path / "a.html", portable, described=described)
+    options = PageOptions(title='Ada & "Bo"', address="https://example.org/heads/a.html")
+    write_page(tmp_path / "a.html", portable, None, options)
     text = (tmp_path / "a.html").read_text()
     for part in (
         "<title>Ada &amp; &quot;Bo&quot;</title>",
@@ -198,7 +198,7 @@ def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.P
     assert "og:" not in (tmp_path / "b.html").read_text()
     assert not (tmp_path / "b.jpg").exists()
     for address in ("me.html", "javascript:alert(1)", "https://"):
-        refuses("is no address; give one such as", check_address, address)
+        refuses("is no address; give one such as", PageOptions(address=address).check, tmp_path)
     runtime.write_portable(tmp_path / "c.mien", replace(drawn_head(10), filmed=None))
     given = ["--title", "Ada", "--address", "https://example.org/c.html"]
     assert main(["export", str(tmp_path / "c.mien"), "--out", str(tmp_path / "c.html"), *given]) == 0
@@ -322,7 +322,7 @@ def test_webgl2_draws_where_webgpu_cannot(site: Path) -> None:
 def test_a_page_draws_with_webgpu(site: Path, tmp_path: Path) -> None:
     """If it is asked to by its address. By itself it does so on a GPU only."""
     portable, page = drawn_head(3000, rank=2), tmp_path / "a.html"
-    write_page(page, portable, webgpu=True)
+    write_page(page, portable, None, PageOptions(webgpu=True))
     plain = write_page(tmp_path / "b.html", portable)
     assert 0 < page.stat().st_size - plain.size < 25_000
     (face,) = faces_of(portable, 1)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from mien.driving.live.one_euro import OneEuro
 from mien.face import FaceModel, FaceParams
-from mien.formats.page import write_packed, write_page
-from mien.formats.shared.webcam import VERSION, find_webcam_files
+from mien.formats.page import PageOptions, write_packed, write_page
+from mien.formats.shared.webcam import VERSION
 from mien.lab.synthetic import motion, scene
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
@@ -79,7 +79,7 @@ def pictures() -> list[str]:
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tasks_vision()
     path = tmp_path_factory.mktemp("page") / "me.html"
-    write_page(path, drawn_head(150), webcam=find_webcam_files())
+    write_page(path, drawn_head(150), None, PageOptions(webcam=True))
     return path
 
 

@@ -23,7 +23,7 @@ from mien.plugins import missing_package
 
 GROUPS = {
     "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),
-    "Use it": ("view", "render", "drive", "export"),
+    "Use it": ("view", "render", "drive", "export", "export-dataset"),
     "Research": ("evaluate", "analyze", "study", "bench", "face-models", "licenses", "plugins"),
 }
 """The sub-commands as `mien --help` lists them."""
@@ -40,6 +40,7 @@ COMMANDS = {
     "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
     "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
     "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
+    "export-dataset": "capture -> the layout of another laboratory, or the videos of the NeRSemble benchmark",
     "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
     "batch": "a table of captures -> an avatar each, here, on Slurm or on Ray",
     "face-models": "list the face models and bake them ahead of time",

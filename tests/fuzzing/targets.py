@@ -159,7 +159,6 @@ _TARGETS = (
     Target("places", "W/**/*", uses.read_workspace, uses.use_run, 4, fault=faults.faulty_place),
     Target("lines", "W/**/*", lambda root, file: None, lines.run_an_odd_line, 3, fault=lines.faulty_or_not, named=False,
            parts=lines.PARTS),
-    Target("scene of a .glb", "exports/head.glb", uses.read_scene, weight=2),
     Target("avatar of a .glb", "exports/head.glb", _of(read_glb_avatar), uses.use_portable, 2),
     Target("head.spz", "exports/head.spz", _read_splats, uses.use_gaussians, 3),
     Target("splats", "splats/*", _read_splats, uses.use_gaussians, 4),

@@ -46,7 +46,6 @@ from mien.face.listing import available_face_models
 from mien.face.models.flame import flame_face_model
 from mien.formats import in_world, read_ply, write_ply
 from mien.formats.gaussian_avatars import write_gaussian_avatars_folder
-from mien.formats.shared.glb_file import read_glb
 from mien.lab.analysis.registry import AnalysisOptions
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.study.files import read_all_answers, read_key
@@ -153,15 +152,6 @@ def read_dataset(root: Path, file: Path) -> Any:
     path = [path for path in places if any(each.recognises(path) is not None for each in datasets())] or places[-1:]
     found = recognised(path[0])[0].read(path[0], None)
     return found if isinstance(found, TrainedAvatar) else list(found)
-
-
-def read_scene(root: Path, file: Path) -> None:
-    """Read all arrays of a .glb scene, as programs do that show it."""
-    glb = read_glb(file)
-    accessors = glb.content.get("accessors")
-    for index in range(min(len(accessors), 50) if isinstance(accessors, list) else 0):
-        with told_of(file, ValueError):
-            glb.array(index).sum()
 
 
 def read_in_node(root: Path, file: Path) -> None:

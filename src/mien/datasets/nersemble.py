@@ -67,7 +67,7 @@ def read_cameras(file: Path, size: tuple[int, int]) -> "dict[str, Camera]":
     """Return each camera by its serial number, for pictures of this width and height.
 
     World-to-camera matrices are OpenCV's, in metres. Intrinsics are one matrix for all cameras, or one for each. Files
-    that `mien export` wrote name the `image_size` that they are for; for others it is found by the principal point.
+    of `mien export-dataset` name the `image_size` that they are for; for others it is found by the principal point.
     """
     from mien.datasets.flame_poses import camera_of
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 VERSION = "FLAME 2023 (flame2023.pkl)"
 TRACKING = "flame2023_tracking_v2.npz"
 TEST_ENDING = "-test"
-"""End of the names of sequences that `mien export` writes of held-out frames. The benchmark itself has none."""
+"""End of the names of sequences that `mien export-dataset` writes of held-out frames. The benchmark itself has none."""
 FPS_MONO, FPS_VIEWS = 24.3, 73.0
 _MAX_ANGLE = 1e-4  # largest difference of the two forms of a rotation
 
@@ -143,7 +143,7 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
 
 
 def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
-    """The split of a folder that `mien export` wrote, whose held-out frames are a sequence of their own."""
+    """The split of a folder that `mien export-dataset` wrote, whose held-out frames are a sequence of their own."""
     from mien.training.settings.splits import OwnSplit
 
     if folder.name.endswith(TEST_ENDING):

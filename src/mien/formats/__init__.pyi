@@ -1,6 +1,7 @@
 from .format import Content as Content
 from .format import Format as Format
-from .format import Options as Options
+from .format import NoOptions as NoOptions
+from .format import PoseOptions as PoseOptions
 from .gaussian_avatars import read_gaussian_avatars_folder as read_gaussian_avatars_folder
 from .gaussian_avatars import write_gaussian_avatars_folder as write_gaussian_avatars_folder
 from .ply import read_ply as read_ply

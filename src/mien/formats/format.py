@@ -3,10 +3,13 @@
 This file needs no torch, because the command line lists the formats and checks options against them.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal
+
+from mien.errors import UserError
 
 if TYPE_CHECKING:
     # By their full names: several rooms have a class of the same name, and the reference tells them apart so.
@@ -14,7 +17,6 @@ if TYPE_CHECKING:
     import mien.face.params
     import mien.formats.glb
     import mien.formats.shared.packed
-    import mien.formats.shared.webcam
     import mien.gaussians
     import mien.runtime.baked
 
@@ -22,73 +24,79 @@ Holds = Literal["pose", "sequence", "avatar", "folder"]
 """What a file of a format holds: Gaussians in one pose, or in many, a whole avatar, or a folder with a whole run."""
 
 
-@runtime_checkable
-class Content(Protocol):
+class Content(ABC):
     """An avatar that is written. A format asks for what it holds, and nothing else is computed."""
 
     @property
+    @abstractmethod
     def count(self) -> int:
         """Number of Gaussians."""
-        ...
 
+    @abstractmethod
     def portable(self, confidence: bool = True, soft_cut: bool = False) -> "mien.runtime.baked.PortableAvatar":
         """Return the whole avatar.
 
         `confidence` asks for what was filmed of each triangle, if that is known, and `soft_cut` for a head that fades
         towards its neck cut.
         """
-        ...
 
-    def mesh(self) -> "mien.formats.glb.MeshModel":
-        """Return the person's mesh with its texture coordinates. Avatars that come from a file have none."""
-        ...
-
+    @abstractmethod
     def pose(self) -> "mien.gaussians.Gaussians":
-        """Return the Gaussians with the expression that was asked for.
+        """Return the Gaussians with the expression that was asked for: the head at the origin, +y up, +z ahead."""
 
-        The head is at the origin, +y up, +z out of the face.
-        """
-        ...
-
-    def poses(self) -> "tuple[Iterator[mien.gaussians.Gaussians], float] | None":
-        """Return the Gaussians of every frame of the motion, as in `pose`, and frames per second; None without one."""
-        ...
+    def poses(self) -> "tuple[Iterator[Content], float] | None":
+        """Return the content in the pose of each frame of the motion, and frames per second; None without a motion."""
+        return None
 
     def motion(self) -> "mien.formats.shared.packed.Motion | None":
-        """Return the motion that was asked for, as face parameters with head poses."""
-        ...
+        """Return the motion that was asked for, as face parameters with head poses; None without one."""
+        return None
+
+    def mesh(self) -> "mien.formats.glb.MeshModel":
+        """Return the person's mesh with its texture coordinates, which only a run has."""
+        raise UserError("a file does not have all that this format needs; export its workspace")
 
     def trained(self) -> "tuple[mien.avatar.avatar.Avatar, mien.face.params.FaceParams]":
-        """Return the trained avatar, and the person at all timesteps of its training."""
-        ...
+        """Return the trained avatar, and the person at all timesteps of its training, which only a run has."""
+        raise UserError("a file does not have all that this format needs; export its workspace")
 
 
 @dataclass(frozen=True)
-class Options:
-    """Options that only some formats take. A format names those that it takes in `Format.options`."""
+class NoOptions:
+    """Options of a format: nothing can be chosen. Formats with options have a class of their own beside the writer."""
 
-    sh: int | None = None
-    """Degree of the spherical harmonics in the file."""
-    webgpu: bool = False
-    """Whether a page draws with WebGPU where the browser has it."""
-    webcam: "mien.formats.shared.webcam.WebcamFiles | None" = None
-    """Files of the face landmarker, with which a webcam drives a page."""
-    spz_version: int = 4
-    """Version of a .spz file."""
-    title: str | None = None
-    """Title of a page. None for the avatar's name."""
-    address: str | None = None
-    """Address at which a page will be published."""
-    soft_cut: bool = True
-    """Whether a head fades towards its neck cut."""
-    microphone: bool = False
-    """Whether the lips of a page follow a voice."""
-    largest: float | None = None
-    """Largest size of a page or a packed avatar, in MB. None for all Gaussians."""
+    def check(self, path: Path) -> None:
+        """Check, before any work, the values, and that the packages which write the file are installed."""
 
 
-def _no_check(path: Path) -> None:
-    """Find nothing missing."""
+@dataclass(frozen=True)
+class MotionOptions(NoOptions):
+    """Options of formats that hold a motion. The fields are options of `mien export`, with these descriptions."""
+
+    series: str | None = None
+    """A motion: the name of a sequence of the workspace, or anything that `mien drive --by` takes. A page plays it. For
+    Gaussians in a pose, every frame becomes a file, or a time sample of the file; the head stays at the origin."""
+    neutral: str | None = None
+    """With --series, the driver's face at rest, as for `mien drive`: first, calm, model, or a video, recording,
+    workspace or sequence folder of the driver at rest."""
+    every: int = 1
+    """With --series, take only every n-th frame."""
+
+    def check(self, path: Path) -> None:
+        """Check that there is a motion if something is said of it."""
+        if self.every < 1:
+            raise UserError(f"--every {self.every}: give 1 or more")
+        if self.series is None and (self.every > 1 or self.neutral is not None):
+            raise UserError(f"{path}: --every and --neutral are for a motion; name it with --series, or leave them out")
+
+
+@dataclass(frozen=True)
+class PoseOptions(MotionOptions):
+    """Options of formats that hold Gaussians in a pose."""
+
+    set: tuple[str, ...] = ()
+    """Expressions and whole faces by name, and joint angles in radians, for example --set smile=0.6 jawOpen=0.3
+    eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
 
 
 @dataclass(frozen=True)
@@ -102,25 +110,13 @@ class Format:
     name: str
     """Name for `mien export --format`."""
     holds: Holds
-    write: Callable[[Path, Content, Options], str]
+    write: Callable[[Path, Content, Any], str]
     endings: tuple[str, ...] = ()
     """Endings of the files, in lower case with the dot. Only folders have none."""
-    read: "Callable[[Path], mien.runtime.baked.PortableAvatar | mien.gaussians.Gaussians] | None" = None
-    """Function that reads a file: a whole avatar, or Gaussians in one pose (the first of a sequence). It raises
-    UserError in one line that names the path. None if files of this format are not read."""
-    options: frozenset[str] = frozenset()
-    """Names of the fields of `Options` that the format takes."""
-    refusals: Mapping[str, str] = field(default_factory=dict)
-    """Why options of `mien export` ("set", "series", "every") have no meaning for the format, each as a sentence."""
-    from_files: bool = True
-    """Whether an avatar that comes from a file can be written. False if the format asks for `mesh` or `trained`."""
-    check: Callable[[Path], None] = _no_check
-    """Function that raises UserError, before any work, if a package is missing."""
-
-    @property
-    def reads_avatars(self) -> bool:
-        """Whether files of the format are read as whole avatars."""
-        return self.read is not None and self.holds == "avatar"
+    read: "Callable[[Path], mien.runtime.baked.PortableAvatar] | None" = None
+    """Function that reads the whole avatar in a file. It raises UserError in one line that names the path."""
+    options: Callable[[], NoOptions] = PoseOptions
+    """Class of the options. The command line has an option for each of its fields."""
 
 
 def pose_words(path: Path, content: Content) -> str:

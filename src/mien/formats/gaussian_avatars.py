@@ -21,26 +21,23 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.files import overwrite
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.avatar.methods import METHODS
-from mien.disk.files import cannot_write, write_atomically
+from mien.disk.files import cannot_write
 from mien.disk.inside import open_to_read
-from mien.disk.limits import MAX_NUMBER
+from mien.disk.limits import MAX_NUMBER, is_moderate
 from mien.errors import UserError
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.formats.format import Content, Options
-from mien.formats.ply import BINDING, property_names, read_columns, stacked, stacked_sh
+from mien.formats.format import Content, NoOptions
+from mien.formats.ply import BINDING, property_names, read_columns, stacked, stacked_sh, write_rows
 from mien.formats.shared.flame_params import read_flame_params, write_flame_params
 from mien.runtime.baked import MeshBound
 
 POINTS, PARAMETERS, MODEL = "point_cloud.ply", "flame_param.npz", "face_model"
 """Names of the files. The face model's are MODEL.json and MODEL.safetensors."""
 _MODEL_FILES = (f"{MODEL}.json", f"{MODEL}.safetensors")
-_METHOD = "gaussian_avatars"
-_HEAD_COMMENT = "comment mien sh_frame: head"
-"""Line of the header if spherical harmonics are evaluated in the head frame. GaussianAvatars evaluates them in the
-world."""
-_WRONG_MODEL = "import it with the face model that it was made with (--face-model)"
+_HEAD_COMMENT = "mien sh_frame: head"
+"""Comment if spherical harmonics are evaluated in the head frame. GaussianAvatars evaluates them in the world."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +50,9 @@ class GaussianAvatarsFolder:
 
 
 def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams) -> None:
-    """Write an avatar of Gaussians bound to triangles, and face parameters, as GaussianAvatars' folder.
+    """Write an avatar of Gaussians bound to triangles, and the subject at any timesteps, as GaussianAvatars' folder.
 
-    Args:
-        folder: The folder. It is made if it is missing, and files of the same names are replaced.
-        avatar: An avatar of GaussianAvatars.
-        face: The subject at any number of timesteps.
+    The folder is made if it is missing, and files of the same names are replaced.
     """
     baked = avatar.bake()
     if not isinstance(baked, MeshBound):
@@ -76,15 +70,15 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
         write_flame_params(aside / PARAMETERS, avatar.face_model, face)
         if avatar.face_model.shareable:
             write_face_model(aside / MODEL, avatar.face_model)
-        _write_points(aside / POINTS, baked)
+        in_head = baked.sh_frame == "head" and baked.attributes.sh.shape[1] > 1
+        frame = f"frame: that of the triangle {BINDING}, in units of its size"
+        write_rows(aside / POINTS, _rows(baked), *([_HEAD_COMMENT] if in_head else []), frame)
 
 
 def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = None) -> GaussianAvatarsFolder:
     """Read a folder that GaussianAvatars or `write_gaussian_avatars_folder` wrote.
 
-    Args:
-        folder: The folder with point_cloud.ply and flame_param.npz.
-        face_model: The face model that the avatar was made with, if it is not in the folder.
+    `face_model` is the one that the avatar was made with, if it is not in the folder.
     """
     path = folder / POINTS
     if not folder.is_dir():
@@ -103,8 +97,8 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
     binding = _binding(columns, path, len(face_model.faces))
     sh = stacked_sh(columns, path)
     face = read_flame_params(folder / PARAMETERS, face_model)
-    method = METHODS[_METHOD]
-    frame = "head" if _HEAD_COMMENT in lines else "world"
+    method = METHODS["gaussian_avatars"]
+    frame = "head" if f"comment {_HEAD_COMMENT}" in lines else "world"
     config = replace(as_published(), sh_degree=int(sh.shape[1] ** 0.5) - 1, sh_frame=frame)
     with torch.random.fork_rng(devices=[]):
         avatar = method.avatar(config, face_model, face)
@@ -116,10 +110,10 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
         "sh_constant": sh[:, :1],
         "sh_rest": sh[:, 1:],
     }
-    for name, tensor in state.items():
-        if not (tensor.numel() == 0 or bool(tensor.abs().max() <= MAX_NUMBER)):
+    for name, array in state.items():
+        if not is_moderate(array):
             raise UserError(f"{path}: {name} holds NaN or numbers beyond {MAX_NUMBER:g}; export it again")
-    trained = {name: state[name] for name in avatar.gaussian_store().trained}
+    trained = {name: torch.from_numpy(state[name]) for name in avatar.gaussian_store().trained}
     own = {key: trained.get(key.rpartition(".")[2], binding) for key in avatar.state_dict()}
     overwrite(avatar, own, len(binding), path)
     return GaussianAvatarsFolder(avatar, face)
@@ -145,24 +139,9 @@ def _replaced_together(folder: Path) -> Iterator[Path]:
         raise cannot_write(folder, error) from None
 
 
-def _write_points(path: Path, baked: MeshBound) -> None:
-    rows = _rows(baked)
-    if not all(np.isfinite(rows[name]).all() for name in rows.dtype.names or ()):
-        raise UserError(f"{path}: some Gaussians are NaN or infinite; train it again")
-    kinds = {np.dtype("<f4"): "float", np.dtype("<i4"): "int"}
-    lines = [f"property {kinds[rows.dtype[name]]} {name}\n" for name in rows.dtype.names or ()]
-    comment = f"{_HEAD_COMMENT}\n" if baked.sh_frame == "head" and baked.attributes.sh.shape[1] > 1 else ""
-    header = (
-        f"ply\nformat binary_little_endian 1.0\n{comment}comment frame: that of the triangle {BINDING}, in units of "
-        f"its size\nelement vertex {len(rows)}\n{''.join(lines)}end_header\n"
-    )
-    write_atomically(path, lambda temporary: temporary.write_bytes(header.encode("ascii") + rows.tobytes()))
-
-
 def _rows(baked: MeshBound) -> np.ndarray:
     """One record per Gaussian: the raw values in the order of `property_names`, then the triangle."""
-    attributes = baked.attributes
-    sh = attributes.sh
+    attributes, sh = baked.attributes, baked.attributes.sh
     columns: list[Float32[np.ndarray, "n _"]] = [
         baked.means, np.zeros_like(baked.means), sh[:, 0], sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1),
         attributes.opacity_logits[:, None], attributes.log_scales, attributes.quats,
@@ -182,18 +161,12 @@ def _binding(columns: dict[str, np.ndarray], path: Path, triangles: int) -> Int[
             f"{path}: lacks {BINDING}, the triangle of each Gaussian; give the {POINTS} of a GaussianAvatars avatar"
         )
     values = columns[BINDING]
-    if values.dtype.kind == "f":
-        wrong = ~np.isfinite(values) | (values != np.round(values))
-        if wrong.any():
-            raise UserError(
-                f"{path}: {BINDING} of Gaussian {int(wrong.argmax())} is {values[wrong.argmax()]:g}, not the index of "
-                "a triangle; export it again"
-            )
-    wrong = (values < 0) | (values >= triangles)
+    wrong = ~((values == np.round(values)) & (values >= 0) & (values < triangles))
     if wrong.any():
         raise UserError(
-            f"{path}: {BINDING} of Gaussian {int(wrong.argmax())} is {values[wrong.argmax()]:.0f}, but the face model "
-            f"has {triangles:,} triangles; {_WRONG_MODEL}"
+            f"{path}: {BINDING} of Gaussian {int(wrong.argmax())} is {values[wrong.argmax()]:g}, not the index of one "
+            f"of the face model's {triangles:,} triangles; import it with the face model that it was made with "
+            "(--face-model)"
         )
     return torch.from_numpy(values.astype(np.int64))
 
@@ -222,15 +195,14 @@ def _refuse_links(path: Path) -> None:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
-_OWN_MODEL = (
-    "\nnote: the folder has the face model {name!r} in it; `mien import` reads it, but GaussianAvatars' viewer opens "
-    "only avatars on FLAME with teeth"
-)
-
-
-def write(path: Path, content: Content, options: Options) -> str:
-    """Write the file, and return what is told of it."""
+def write(path: Path, content: Content, options: NoOptions) -> str:
+    """Write the folder, and return what is told of it."""
     avatar, face = content.trained()
     write_gaussian_avatars_folder(path, avatar, face)
-    note = "" if avatar.face_model.flame_origin is not None else _OWN_MODEL.format(name=avatar.face_model.name)
-    return f"{content.count:,} Gaussians, {len(face)} timesteps{note}"
+    told = f"{content.count:,} Gaussians, {len(face)} timesteps"
+    if avatar.face_model.flame_origin is not None:
+        return told
+    return (
+        f"{told}\nnote: the folder has the face model {avatar.face_model.name!r} in it; `mien import` reads it, but "
+        "GaussianAvatars' viewer opens only avatars on FLAME with teeth"
+    )

@@ -8,20 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, Int
 
 from mien import runtime
 from mien.disk.files import check_writable
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
-from mien.formats.format import Content, Options
+from mien.formats.format import Content, NoOptions
 from mien.formats.shared.glb_file import INDICES, VERTICES, Glb, GlbWriter, read_glb
 from mien.formats.shared.splats import unit_quats
-from mien.formats.shared.texture import FRONT_VIEWS, Shot, Surface, bake_texture
-from mien.media.picture_files import encode_picture
 from mien.runtime.baked import MeshBound, PortableAvatar, Rig
 from mien.runtime.file import from_arrays, to_arrays
 from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
@@ -29,82 +25,29 @@ from mien.runtime.posing import SH_C0, Face, Gaussians, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 
 EXTENSION, VERSION = "MIEN_gaussian_avatar", 1
-_KINDS = {"float32": np.dtype("<f4"), "int32": np.dtype("<i4")}
-_REMEDY = "write it again with `mien export DIR --out me.glb`"
-
-
-def avatar_extension(path: Path, writer: GlbWriter, avatar: PortableAvatar) -> dict[str, Any]:
-    """Add the arrays of an avatar to a file, and return the extension that refers to them."""
-    header, arrays = to_arrays(path, avatar)
-    tensors = {}
-    for name, array in sorted(arrays.items()):
-        kind = _KINDS[array.dtype.name]
-        tensors[name] = {"dtype": array.dtype.name, "shape": list(array.shape)}
-        if array.size:  # a buffer view has at least one byte
-            tensors[name]["bufferView"] = writer.view(np.ascontiguousarray(array, kind).tobytes())
-    return {"version": VERSION, "avatar": header, "tensors": tensors}
-
-
-def read_glb_avatar(path: Path) -> PortableAvatar:
-    """Read the avatar in a .glb file: equal to that of the .mien file, array by array."""
-    glb = read_glb(path)
-    extensions = glb.content.get("extensions")
-    found = extensions.get(EXTENSION) if isinstance(extensions, dict) else None
-    if not isinstance(found, dict):
-        raise UserError(f"{path}: has no avatar of mien ({EXTENSION}); {_REMEDY}")
-    if found.get("version") != VERSION:
-        raise UserError(
-            f"{path}: has version {found.get('version')!r:.80} of {EXTENSION}, expected {VERSION}; {_REMEDY}"
-        )
-    try:
-        # Several arrays must not share a view, as a small file would otherwise fill the memory.
-        views = [described["bufferView"] for described in found["tensors"].values() if "bufferView" in described]
-        if sum(glb.content["bufferViews"][view]["byteLength"] for view in views) > len(glb.buffer):
-            raise ValueError("its arrays are larger than its buffer")
-        arrays = {name: _tensor(glb, described) for name, described in found["tensors"].items()}
-        header = dict(found["avatar"])
-        if "format" not in header:
-            raise ValueError("its header has no format")
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
-        raise UserError(f"{path}: is damaged ({repr(error)[:100]}); {_REMEDY}") from None
-    return from_arrays(path, header, arrays)
-
-
-def _tensor(glb: Glb, described: dict[str, Any]) -> np.ndarray:
-    shape, kind = described["shape"], _KINDS[described["dtype"]]
-    if not isinstance(shape, list) or not all(type(size) is int and size >= 0 for size in shape):
-        raise ValueError("a tensor's shape is wrong")
-    data = glb.bytes_of(described["bufferView"]) if "bufferView" in described else b""
-    return np.frombuffer(data, kind).reshape(shape).copy()
-
-
-FORMAT, VERSION = "mien.glb", 1
 TEXTURE_SIZE = 1024
 """Side of the texture in texels."""
-_JPEG_QUALITY = 92
+_SPLATS = "KHR_gaussian_splatting"
+_ANIMATES = (
+    "Morph targets and skin move the mesh. The Gaussians show the person at rest and do not move in programs that do "
+    f"not know {EXTENSION}, which has what moves them."
+)
+_KINDS = {"float32": np.dtype("<f4"), "int32": np.dtype("<i4")}
 _JOINTS = 4
 """Number of joints of a vertex, which is what every engine supports."""
 _JAW, _LOOK, _HIDDEN = 0.7, 0.4, 0.01
 """Pose that shows what is hidden at rest: jawOpen, and eyes to each side in radians; and the weight of its pictures."""
 _MOVED = 1e-6
 """Distance in metres below which a morph target does not move a vertex."""
-_ANIMATES = (
-    "Morph targets and skin move the mesh. The Gaussians show the person at rest and do not move in programs that do "
-    f"not know {EXTENSION}, which has what moves them."
-)
-_SPLATS = "KHR_gaussian_splatting"
+_REMEDY = "write it again with `mien export DIR --out me.glb`"
 
 
 @dataclass(frozen=True)
-class WrittenGlb:
-    """A .glb file on disk."""
+class GlbOptions(NoOptions):
+    """Options of .glb files."""
 
-    size: int
-    """Size in bytes."""
-    targets: tuple[str, ...]
-    """Names of the morph targets."""
-    missing: tuple[str, ...]
-    """ARKit's expressions that the face model cannot show."""
+    mesh_only: bool = False
+    """Write only the mesh that engines animate, 1 to 2 MB: without Gaussians, and without what mien reads back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,20 +62,30 @@ class MeshModel:
     """Indices into `uv`."""
 
 
-def write_glb(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int = TEXTURE_SIZE) -> WrittenGlb:
-    """Write an avatar as one .glb file, in the head frame, in metres. The same input gives the same bytes."""
+def write_glb(
+    path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int = TEXTURE_SIZE, *, mesh_only: bool = False
+) -> tuple[str, ...]:
+    """Write an avatar as one .glb file, in the head frame, in metres, and return the names of the morph targets.
+
+    The same input gives the same bytes.
+    """
     head = head_of(path, avatar, model, texture_size)
     writer, content = head.writer, head.content
-    _add_splats(writer, content, avatar, head.gaussians)
-    about = {**vars(avatar.about), "format": FORMAT, "version": VERSION, "animates": _ANIMATES}
-    content |= {
-        "asset": {"version": "2.0", "generator": f"mien {avatar.about.mien}", "extras": {"mien": about}},
-        "scene": 0,
-        "scenes": [{"name": "mesh", "nodes": [0, 1]}, {"name": "gaussians", "nodes": [len(content["nodes"]) - 1]}],
-        "extensionsUsed": ["KHR_materials_unlit", _SPLATS, EXTENSION],
-        "extensions": {EXTENSION: avatar_extension(path, writer, avatar)},
-    }
-    return head.write(path)
+    about = {**vars(avatar.about), "format": "mien.glb", "version": 1}
+    scenes: list[dict[str, Any]] = [{"name": "mesh", "nodes": [0, 1]}]
+    used = ["KHR_materials_unlit"]
+    if not mesh_only:
+        _add_splats(writer, content, avatar, head.gaussians)
+        about["animates"] = _ANIMATES
+        scenes.append({"name": "gaussians", "nodes": [len(content["nodes"]) - 1]})
+        used += [_SPLATS, EXTENSION]
+    generator = f"mien {avatar.about.mien}"
+    content["asset"] = {"version": "2.0", "generator": generator, "extras": {"mien": about}}
+    content |= {"scene": 0, "scenes": scenes, "extensionsUsed": used}
+    if not mesh_only:
+        content["extensions"] = {EXTENSION: _avatar_extension(path, writer, avatar)}
+    writer.write(path, content)
+    return head.targets
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,16 +100,12 @@ class Head:
     gaussians: Gaussians
     """The Gaussians of the person at rest, in the head frame."""
 
-    def write(self, path: Path) -> WrittenGlb:
-        """Write the file with what `content` holds by now."""
-        missing = tuple(name for name in ARKIT_NAMES if name not in self.targets)
-        return WrittenGlb(self.writer.write(path, self.content), self.targets, missing)
-
 
 def head_of(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int) -> Head:
     """The mesh of the person at rest with morph targets, skin and texture, in the head frame, in metres."""
     check_writable(path)
-    face = _at_rest(avatar)
+    zero = np.zeros(3, np.float32)
+    face = Face(avatar.neutral.expression, avatar.neutral.joints, zero, zero)
     vertices = rig_points(model.rig, face)
     gaussians = runtime.pose(avatar.baked, face)
     for name, array in (("mesh", vertices), ("Gaussians", gaussians.means), ("Gaussians", gaussians.scales)):
@@ -213,15 +162,13 @@ def joint_positions(rig: Rig, face: Face) -> Float[np.ndarray, "k 3"]:
     return positions
 
 
-def _at_rest(avatar: PortableAvatar) -> Face:
-    zero = np.zeros(3, np.float32)
-    return Face(avatar.neutral.expression, avatar.neutral.joints, zero, zero)
-
-
 def _texture(avatar: PortableAvatar, model: MeshModel, face: Face, size: int) -> Float32[np.ndarray, "s s 3"]:
     """The texture, seen at rest, and with an open mouth and eyes to each side."""
-    tensors = (model.faces, model.uv, model.uv_faces)
-    surface = Surface(*(torch.from_numpy(np.asarray(array, _kind_of(array))) for array in tensors))
+    import torch
+
+    from mien.formats.shared.texture import FRONT_VIEWS, Shot, Surface, bake_texture
+
+    faces, uv_faces = (torch.from_numpy(np.asarray(each, np.int64)) for each in (model.faces, model.uv_faces))
 
     def shot(posed: Face, **how: Any) -> Shot:
         return Shot(torch.from_numpy(rig_points(model.rig, posed)), runtime.pose(avatar.baked, posed), **how)
@@ -236,11 +183,7 @@ def _texture(avatar: PortableAvatar, model: MeshModel, face: Face, size: int) ->
                     joints[avatar.joint_names.index(eye), 1] += side
             posed = replace(face, expression=expression, joints=joints)
             shots.append(shot(posed, views=FRONT_VIEWS, weight=_HIDDEN))
-    return bake_texture(surface, shots, size)
-
-
-def _kind_of(array: np.ndarray) -> type:
-    return np.int64 if array.dtype.kind in "iu" else np.float32
+    return bake_texture(Surface(faces, torch.from_numpy(model.uv), uv_faces), shots, size)
 
 
 def _mesh_content(
@@ -317,9 +260,7 @@ def _skin(writer: GlbWriter, rig: Rig, face: Face, first_node: int) -> dict[str,
 
 
 def _add_texture(writer: GlbWriter, content: dict[str, Any], texture: Float32[np.ndarray, "s s 3"]) -> None:
-    picture = (texture * 255 + 0.5).astype(np.uint8)
-    data = encode_picture(picture, ".jpeg", (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
-    content["images"] = [{"mimeType": "image/jpeg", "bufferView": writer.view(data)}]
+    content["images"] = [writer.jpeg(texture, 92)]
     content["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
     content["textures"] = [{"source": 0, "sampler": 0}]
     surface = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
@@ -362,11 +303,55 @@ def _linear(colors: np.ndarray) -> np.ndarray:
     return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
-def write(path: Path, content: Content, options: Options) -> str:
+def _avatar_extension(path: Path, writer: GlbWriter, avatar: PortableAvatar) -> dict[str, Any]:
+    """Add the arrays of an avatar to a file, and return the extension that refers to them."""
+    header, arrays = to_arrays(path, avatar)
+    tensors = {}
+    for name, array in sorted(arrays.items()):
+        kind = _KINDS[array.dtype.name]
+        tensors[name] = {"dtype": array.dtype.name, "shape": list(array.shape)}
+        if array.size:  # a buffer view has at least one byte
+            tensors[name]["bufferView"] = writer.view(np.ascontiguousarray(array, kind).tobytes())
+    return {"version": VERSION, "avatar": header, "tensors": tensors}
+
+
+def read_glb_avatar(path: Path) -> PortableAvatar:
+    """Read the avatar in a .glb file: equal to that of the .mien file, array by array."""
+    glb = read_glb(path)
+    extensions = glb.content.get("extensions")
+    found = extensions.get(EXTENSION) if isinstance(extensions, dict) else None
+    if not isinstance(found, dict):
+        raise UserError(f"{path}: has no avatar of mien ({EXTENSION}); {_REMEDY}")
+    if found.get("version") != VERSION:
+        raise UserError(
+            f"{path}: has version {found.get('version')!r:.80} of {EXTENSION}, expected {VERSION}; {_REMEDY}"
+        )
+    try:
+        # Several arrays must not share a view, as a small file would otherwise fill the memory.
+        views = [described["bufferView"] for described in found["tensors"].values() if "bufferView" in described]
+        if sum(glb.content["bufferViews"][view]["byteLength"] for view in views) > len(glb.buffer):
+            raise ValueError("its arrays are larger than its buffer")
+        arrays = {name: _tensor(glb, described) for name, described in found["tensors"].items()}
+        header = dict(found["avatar"])
+        if "format" not in header:
+            raise ValueError("its header has no format")
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
+        raise UserError(f"{path}: is damaged ({repr(error)[:100]}); {_REMEDY}") from None
+    return from_arrays(path, header, arrays)
+
+
+def _tensor(glb: Glb, described: dict[str, Any]) -> np.ndarray:
+    shape, kind = described["shape"], _KINDS[described["dtype"]]
+    if not isinstance(shape, list) or not all(type(size) is int and size >= 0 for size in shape):
+        raise ValueError("a tensor's shape is wrong")
+    data = glb.bytes_of(described["bufferView"]) if "bufferView" in described else b""
+    return np.frombuffer(data, kind).reshape(shape).copy()
+
+
+def write(path: Path, content: Content, options: GlbOptions) -> str:
     """Write the file, and return what is told of it."""
     mesh = content.mesh()
-    written = write_glb(path, content.portable(), mesh)
-    return (
-        f"a mesh with {len(written.targets)} morph targets and {len(mesh.rig.joint_names)} joints, "
-        f"{content.count:,} Gaussians at rest, {written.size / 1e6:.1f} MB"
-    )
+    targets = write_glb(path, content.portable(), mesh, mesh_only=options.mesh_only)
+    splats = "" if options.mesh_only else f"{content.count:,} Gaussians at rest, "
+    joints = len(mesh.rig.joint_names)
+    return f"a mesh with {len(targets)} morph targets and {joints} joints, {splats}{path.stat().st_size / 1e6:.1f} MB"

@@ -3,28 +3,26 @@
 import math
 import os
 import re
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float32
-from torch import Tensor
 
 from mien.disk.files import write_atomically
 from mien.disk.limits import rigid_fault
 from mien.disk.reading import open_ordinary
 from mien.errors import UserError
-from mien.formats.format import Content, Options, pose_words
-from mien.gaussians import Gaussians
+from mien.formats.format import Content, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS, SplatOptions
+
+if TYPE_CHECKING:
+    import mien.gaussians
 
 _MAX_HEADER_BYTES = 65536
-_REST_COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}
-"""Number of SH coefficients (1, 4, 9, 16) by the number of f_rest_* properties."""
-_MAX_COUNT_DIGITS = 12
-MAX_GAUSSIANS = 2_000_000
-"""Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
+_REST_COEFFICIENTS = (0, 9, 24, 45)
+"""Numbers of f_rest_* properties of degrees 0 to 3."""
 _MAX_BYTES = 1 << 29
 """Most bytes of vertices that are read: that number of Gaussians, with spherical harmonics of degree 3."""
 _TYPES = {
@@ -37,10 +35,19 @@ _FIRST_LINE = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
 _READ = re.compile(r"[xyz]|opacity|f_(dc|rest)_[0-9]+|scale_[0-9]+|rot_[0-9]+")
 """Names of the properties that are read, which have one of these types."""
 _FLOATS = ("float", "float32", "double", "float64")
+_WORDS = {"position": "means", "rotation": "quats", "scale": "scales", "opacity": "opacities", "color": "sh"}
 BINDING = "binding_0"
 """Property of GaussianAvatars' files: the index of the triangle in whose frame a Gaussian is given."""
 _LOCAL_COMMENT = "mien frame: local"
-_WORLD_COMMENT = "mien frame: world"
+
+
+@dataclass(frozen=True)
+class PlyOptions(SplatOptions):
+    """Options of .ply files."""
+
+    sh: Literal[0, 1, 2, 3] | None = None
+    """Degree of the spherical harmonics in the file. Coefficients that the avatar lacks are zeros, for programs that
+    expect those of degree 3: 248 bytes for each Gaussian (default: the avatar's own degree)."""
 
 
 def property_names(sh_coefficients: int) -> list[str]:
@@ -50,7 +57,7 @@ def property_names(sh_coefficients: int) -> list[str]:
     return ["x", "y", "z", "nx", "ny", "nz", *dc, *rest, "opacity", *scales, *quats]
 
 
-def write_ply(path: Path, gaussians: Gaussians, degree: int | None = None) -> None:
+def write_ply(path: Path, gaussians: "mien.gaussians.Gaussians", degree: int | None = None) -> None:
     """Write unbatched Gaussians as binary little-endian .ply with raw values, in the layout of the 3DGS training code.
 
     `opacity` is a logit, `scale_*` are natural logarithms of metres, `rot_*` is wxyz of unit length, and `f_rest_*`
@@ -58,53 +65,38 @@ def write_ply(path: Path, gaussians: Gaussians, degree: int | None = None) -> No
     frame if `T_world_local` is set, and in world space otherwise. A comment line keeps that pose for `read_ply`. Other
     programs have no local frame: use `in_world` first if the pose matters to them.
 
-    Args:
-        path: The file.
-        gaussians: Gaussians.
-        degree: Degree of the spherical harmonics in the file, 0 to 3. Coefficients that the Gaussians lack are zero,
-            which does not change their colours: some programs read only degree 3. By default, that of the Gaussians.
-
-    Raises:
-        UserError: a value is NaN or infinite, or the Gaussians have a higher degree.
+    `degree` is that of the spherical harmonics in the file, 0 to 3, by default that of the Gaussians. Coefficients that
+    the Gaussians lack are zero, which does not change their colours: some programs read only degree 3.
     """
     assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
-    if degree is not None:
-        gaussians = _padded(path, gaussians, degree)
-    rows = _raw_rows(gaussians)
-    if not np.isfinite(rows).all():
-        bad = int((~np.isfinite(rows)).any(1).sum())
-        raise UserError(f"{path}: {bad} of {len(rows)} Gaussians are NaN or infinite; train it again")
-    frame = _WORLD_COMMENT
-    if gaussians.T_world_local is not None:
-        pose = gaussians.T_world_local.detach().cpu().double().flatten().tolist()
-        frame = _LOCAL_COMMENT + ", T_world_local row by row: " + " ".join(repr(value) for value in pose)
-    properties = "".join(f"property float {name}\n" for name in property_names(gaussians.sh.shape[-2]))
-    header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment {frame}\ncomment units: metres\n"
-        f"element vertex {len(rows)}\n{properties}end_header\n"
-    )
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
-
-    write_atomically(path, write)
-
-
-def _padded(path: Path, gaussians: Gaussians, degree: int) -> Gaussians:
-    sh, coefficients = gaussians.sh, (degree + 1) ** 2
+    sh, coefficients = gaussians.sh, gaussians.sh.shape[1] if degree is None else (degree + 1) ** 2
     if sh.shape[1] > coefficients:
         own = math.isqrt(sh.shape[1]) - 1
         raise UserError(f"{path}: --sh {degree}: the avatar has degree {own}; give {own} or more, or leave it out")
-    return replace(gaussians, sh=torch.cat([sh, sh.new_zeros(len(sh), coefficients - sh.shape[1], 3)], dim=1))
+    columns = _raw_columns(gaussians, coefficients)
+    rows = columns.view([(name, "<f4") for name in property_names(coefficients)])[:, 0]
+    frame = "mien frame: world"
+    if gaussians.T_world_local is not None:
+        pose = gaussians.T_world_local.detach().cpu().double().flatten().tolist()
+        frame = _LOCAL_COMMENT + ", T_world_local row by row: " + " ".join(repr(value) for value in pose)
+    write_rows(path, rows, frame, "units: metres")
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read a 3D Gaussian .ply of mien or of another program. Unknown properties are skipped.
+def write_rows(path: Path, rows: np.ndarray, *comments: str) -> None:
+    """Write records of float32 and int32 as a .ply."""
+    bad = sum(~np.isfinite(rows[name]) for name in rows.dtype.names or ()) > 0
+    if np.any(bad):
+        raise UserError(f"{path}: {np.sum(bad)} of {len(rows)} Gaussians are NaN or infinite; train it again")
+    kinds = {np.dtype("<f4"): "float", np.dtype("<i4"): "int"}
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {words}" for words in comments)]
+    lines += [f"element vertex {len(rows)}"]
+    lines += [f"property {kinds[rows.dtype[name]]} {name}" for name in rows.dtype.names or ()]
+    header = "\n".join([*lines, "end_header", ""]).encode("ascii")
+    write_atomically(path, lambda temporary: temporary.write_bytes(header + rows.tobytes()))
 
-    Raises:
-        UserError: the file is missing, truncated, not a ply, ASCII or big-endian, or holds NaN or no 3D Gaussians; or
-            its Gaussians are given in the frames of triangles (`BINDING`), so that they have no place without a mesh.
-    """
+
+def read_ply(path: Path) -> "mien.gaussians.Gaussians":
+    """Read a 3D Gaussian .ply of mien or of another program. Unknown properties are skipped."""
     columns, lines = read_columns(path)
     if BINDING in columns:
         raise UserError(
@@ -143,29 +135,27 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     return {name: rows[name] for name in row.names or ()}, lines
 
 
-def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Tensor:
-    """Some columns side by side, [n, len(names)] float32."""
+def stacked(columns: dict[str, np.ndarray], names: list[str], path: Path) -> Float32[np.ndarray, "n c"]:
+    """Some columns side by side."""
     missing = [name for name in names if name not in columns]
     if missing:
         raise UserError(f"{path}: lacks {missing[0]}; give a .ply with 3D Gaussians")
     with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, which callers refuse
-        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).astype(np.float32, copy=False))
+        return np.stack([columns[name] for name in names], axis=1).astype(np.float32, copy=False)
 
 
-def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Tensor:
-    """The spherical harmonics, [n, k, 3]."""
+def stacked_sh(columns: dict[str, np.ndarray], path: Path) -> Float32[np.ndarray, "n k 3"]:
+    """The spherical harmonics."""
     rest = sum(name.startswith("f_rest_") for name in columns)
     if rest not in _REST_COEFFICIENTS:
         raise UserError(
             f"{path}: has {rest} f_rest_* properties, not 0, 9, 24 or 45 (SH degree 0 to 3); give another .ply"
         )
-    coefficients = _REST_COEFFICIENTS[rest]
-    dc = stacked(columns, [f"f_dc_{i}" for i in range(3)], path)[:, None]
-    higher = dc.new_zeros(len(dc), 0, 3)
-    if rest:
-        channels = stacked(columns, [f"f_rest_{i}" for i in range(rest)], path).reshape(-1, 3, coefficients - 1)
-        higher = channels.transpose(1, 2)
-    return torch.cat([dc, higher], dim=1).contiguous()
+    first = stacked(columns, [f"f_dc_{i}" for i in range(3)], path)[:, None]
+    if not rest:
+        return first
+    channels = stacked(columns, [f"f_rest_{i}" for i in range(rest)], path).reshape(len(first), 3, rest // 3)
+    return np.concatenate([first, channels.transpose(0, 2, 1)], axis=1)
 
 
 def _read_header(path: Path, file: IO[bytes]) -> list[str]:
@@ -181,15 +171,19 @@ def _read_header(path: Path, file: IO[bytes]) -> list[str]:
     return [" ".join(line.split()) for line in lines]
 
 
-def _raw_rows(gaussians: Gaussians) -> Float32[np.ndarray, "n p"]:
+def _raw_columns(gaussians: "mien.gaussians.Gaussians", coefficients: int) -> Float32[np.ndarray, "n p"]:
     """One row of float32 per Gaussian, in the order of `property_names`."""
+    import torch
+
+    sh = gaussians.sh.detach()
+    sh = torch.cat([sh, sh.new_zeros(len(sh), coefficients - sh.shape[1], 3)], dim=1)
     # Logits of exactly 0 and 1 are infinite. Logits of +-16.6 give 6e-8 and the float32 next to 1.
     opacities = gaussians.opacities.detach().double().clamp(6e-8, 1 - 6e-8)
     columns = (
         gaussians.means.detach(),
         torch.zeros_like(gaussians.means),
-        gaussians.sh[:, 0].detach(),
-        gaussians.sh[:, 1:].detach().transpose(1, 2).flatten(1),
+        sh[:, 0],
+        sh[:, 1:].transpose(1, 2).flatten(1),
         torch.logit(opacities)[:, None],
         gaussians.scales.detach().double().log(),
         torch.nn.functional.normalize(gaussians.quats.detach(), dim=-1),
@@ -220,11 +214,6 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
     if missing or others:
         reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
         raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise UserError(f"{path}: has the property {twice!r:.60} twice; give a .ply with 3D Gaussians")
-    if len(elements[0][2]) > _MAX_COUNT_DIGITS:
-        raise UserError(f"{path}: has too many vertices ({elements[0][2][:_MAX_COUNT_DIGITS]}...); export it again")
     return int(elements[0][2]), np.dtype([(entry[2], _TYPES[entry[1]]) for entry in properties])
 
 
@@ -235,39 +224,47 @@ def _is_known_type(entry: list[str]) -> bool:
     return entry[1] in (_FLOATS if _READ.fullmatch(entry[2]) else _TYPES)
 
 
-def _pose_of(path: Path, lines: list[str]) -> Tensor | None:
+def _pose_of(path: Path, lines: list[str]) -> Float32[np.ndarray, "4 4"] | None:
     """T_world_local from the comment line, or None for a file in world space or of another program."""
     marked = [line for line in lines if line.startswith(f"comment {_LOCAL_COMMENT}")]
     if not marked:
         return None
     try:
-        pose = torch.tensor([float(value) for value in marked[0].split(":")[-1].split()]).reshape(4, 4)
-        if rigid_fault(pose.numpy()) is not None:
+        with np.errstate(over="ignore"):
+            pose = np.array([float(value) for value in marked[0].split(":")[-1].split()], np.float32).reshape(4, 4)
+        if rigid_fault(pose) is not None:
             raise ValueError
         return pose
-    except (ValueError, RuntimeError):
+    except ValueError:
         raise UserError(f"{path}: has a damaged frame comment, {marked[0]!r}; export it again") from None
 
 
-def _activated(columns: dict[str, np.ndarray], pose: Tensor | None, path: Path) -> Gaussians:
+def _activated(
+    columns: dict[str, np.ndarray], pose: Float32[np.ndarray, "4 4"] | None, path: Path
+) -> "mien.gaussians.Gaussians":
     """Gaussians from raw columns by name."""
+    import torch
+
+    from mien.gaussians import Gaussians
+
+    def read(*names: str) -> torch.Tensor:
+        return torch.from_numpy(stacked(columns, list(names), path))
+
     gaussians = Gaussians(
-        means=stacked(columns, ["x", "y", "z"], path),
-        quats=stacked(columns, [f"rot_{i}" for i in range(4)], path),
-        scales=stacked(columns, [f"scale_{i}" for i in range(3)], path).exp(),
-        opacities=torch.sigmoid(stacked(columns, ["opacity"], path)[:, 0]),
-        sh=stacked_sh(columns, path),
-        T_world_local=pose,
+        means=read("x", "y", "z"),
+        quats=read(*(f"rot_{i}" for i in range(4))),
+        scales=read(*(f"scale_{i}" for i in range(3))).exp(),
+        opacities=torch.sigmoid(read("opacity")[:, 0]),
+        sh=torch.from_numpy(stacked_sh(columns, path)),
+        T_world_local=None if pose is None else torch.from_numpy(pose),
     )
-    columns_read = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh.flatten(1))
-    bad = [not tensor.isfinite().all() for tensor in columns_read]
-    if any(bad):
-        name = ("position", "rotation", "scale", "opacity", "color")[bad.index(True)]
-        raise UserError(f"{path}: the {name} of some Gaussians is NaN or infinite; export it again, or clean it up")
+    for word, name in _WORDS.items():
+        if not getattr(gaussians, name).isfinite().all():
+            raise UserError(f"{path}: the {word} of some Gaussians is NaN or infinite; export it again, or clean it up")
     return gaussians
 
 
-def write(path: Path, content: Content, options: Options) -> str:
+def write(path: Path, content: Content, options: PlyOptions) -> str:
     """Write the file, and return what is told of it."""
-    write_ply(path, content.pose(), options.sh)
+    write_ply(path, options.pose(content), options.sh)
     return pose_words(path, content)

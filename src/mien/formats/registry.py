@@ -8,92 +8,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mien.formats.format import Format
+from mien.formats.format import Format, NoOptions
 from mien.plugins import named, plugin, with_plugins
 
 
 def _of(place: str) -> Callable[..., Any]:
-    """A function of a file of this folder, "FILE:NAME"."""
+    """A function or a class of a file of this folder, "FILE:NAME"."""
     return lambda *arguments: named(f"mien.formats.{place}")(*arguments)
 
 
-def _whole(why: str) -> dict[str, str]:
-    """Why a format with all expressions does not take one of them, or a motion."""
-    return dict.fromkeys(("set", "series"), f"{why}; leave --set and --series out")
-
-
-_PAGE_REFUSES = {"set": "a page sets every expression itself; leave --set out"}
+_USD = (".usd", ".usda", ".usdc", ".usdz")
 _OWN = (
-    Format(
-        "mien",
-        "avatar",
-        _of("mien:write"),
-        (".mien",),
-        _of("mien:read_portable"),
-        options=frozenset({"soft_cut"}),
-        refusals=_whole("a .mien file holds every expression"),
-    ),
-    Format(
-        "html",
-        "avatar",
-        _of("page:write"),
-        (".html",),
-        options=frozenset({"webgpu", "webcam", "microphone", "title", "address", "soft_cut", "largest"}),
-        refusals=_PAGE_REFUSES,
-    ),
-    Format(
-        "packed",
-        "avatar",
-        _of("page:write_packed_file"),
-        (".packed",),
-        options=frozenset({"soft_cut", "largest"}),
-        refusals=_PAGE_REFUSES,
-    ),
-    Format(
-        "glb",
-        "avatar",
-        _of("glb:write"),
-        (".glb",),
-        _of("glb:read_glb_avatar"),
-        from_files=False,
-        refusals=_whole("a .glb file has a morph target for every expression"),
-    ),
-    Format(
-        "vrm",
-        "avatar",
-        _of("vrm:write"),
-        (".vrm",),
-        from_files=False,
-        refusals=_whole("a .vrm file has an expression for every name"),
-    ),
-    Format("ply", "pose", _of("ply:write"), (".ply",), _of("ply:read_ply"), options=frozenset({"sh"})),
-    Format(
-        "spz",
-        "pose",
-        _of("spz:write"),
-        (".spz",),
-        _of("spz:read_spz"),
-        options=frozenset({"spz_version"}),
-    ),
-    Format("sog", "pose", _of("sog:write"), (".sog",), _of("sog:read_sog")),
-    Format(
-        "usd",
-        "sequence",
-        _of("usd:write"),
-        (".usd", ".usda", ".usdc", ".usdz"),
-        _of("usd:read_usd"),
-        check=_of("usd:check_usd"),
-    ),
-    Format(
-        "gaussian-avatars",
-        "folder",
-        _of("gaussian_avatars:write"),
-        from_files=False,
-        refusals=dict.fromkeys(
-            ("set", "series", "every"),
-            "GaussianAvatars' folder holds every timestep; leave --set, --series and --every out",
-        ),
-    ),
+    Format("mien", "avatar", _of("mien:write"), (".mien",), _of("mien:read_portable"), _of("mien:MienOptions")),
+    Format("html", "avatar", _of("page:write"), (".html",), options=_of("page:PageOptions")),
+    Format("packed", "avatar", _of("page:write_packed_file"), (".packed",), options=_of("page:PackedOptions")),
+    Format("glb", "avatar", _of("glb:write"), (".glb",), _of("glb:read_glb_avatar"), _of("glb:GlbOptions")),
+    Format("vrm", "avatar", _of("vrm:write"), (".vrm",), options=NoOptions),
+    Format("ply", "pose", _of("ply:write"), (".ply",), options=_of("ply:PlyOptions")),
+    Format("spz", "pose", _of("spz:write"), (".spz",), options=_of("spz:SpzOptions")),
+    Format("sog", "pose", _of("sog:write"), (".sog",), options=_of("shared.splats:SplatOptions")),
+    Format("usd", "sequence", _of("usd:write"), _USD, options=_of("usd:UsdOptions")),
+    Format("gaussian-avatars", "folder", _of("gaussian_avatars:write"), options=NoOptions),
 )
 
 _GROUP = "mien.formats"
@@ -106,11 +41,6 @@ def formats() -> list[Format]:
     A format is left out, with a warning, if it cannot be imported, or has the name or an ending of one before it.
     """
     return with_plugins(_GROUP, Format, _OWN, lambda each: (each.name, *each.endings))
-
-
-def endings(only_from_files: bool = False) -> list[str]:
-    """Return the endings of all formats, or of those that an avatar in a file can be written as."""
-    return [ending for each in formats() if each.from_files or not only_from_files for ending in each.endings]
 
 
 def format_of(path: Path) -> Format | None:

@@ -6,46 +6,31 @@ Source: the specification at developer.playcanvas.com, "The SOG Format".
 import io
 import json
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from mien.disk.files import write_atomically
 from mien.disk.limits import checked_whole
 from mien.disk.reading import open_archive, open_member, open_ordinary, parse_json
 from mien.errors import UserError
-from mien.formats.format import Content, Options, pose_words
-from mien.formats.shared.splats import finite_arrays, unit_quats
+from mien.formats.format import Content, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS, SplatOptions, finite_arrays, gaussians_of, unit_quats
 from mien.gaussians import Gaussians
 from mien.media.decoding import announced_size
 
-_VERSION = 2
-_CODES, _ROUNDS = 256, 20
-_PALETTE_BITS = 16
-_PALETTE_COLUMNS = 64
-_MODE = 252
-_EFFORT = 20
-"""Effort of the lossless compression, 0 to 100. More takes ten times as long and gains a few percent."""
+_VERSION, _CODES, _PALETTE_COLUMNS, _MODE = 2, 256, 64, 252
+"""Numbers of the specification."""
 _MIN_SCALE = 1e-7
 """Least standard deviation in metres, so that Gaussians without a width do not take values from the others."""
 _BANDS = {3: 1, 8: 2, 15: 3}
 """Number of bands by the number of SH coefficients after the first."""
-_DATE = (1980, 1, 1, 0, 0, 0)
-_MAX_MEMBER, _MAX_META, _MAX_GAUSSIANS = 1 << 26, 1 << 20, 2_000_000
-_MAX_PALETTE = (1 << _PALETTE_BITS) * 15 + (1 << 16)
-"""Most pixels of the coefficients that Gaussians share."""
-_SPARE_PIXELS = 1 << 16
-"""Pixels that a picture may have besides two for each Gaussian: other programs round its sides up."""
-_DAMAGE = (
-    OSError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, SyntaxError, EOFError, zlib.error,
-    zipfile.BadZipFile, UnidentifiedImageError, Image.DecompressionBombError,
-)  # fmt: skip
-"""What Python's zip files, Pillow and numpy raise for damaged content."""
-_REMEDY = "give a .sog of version 2, as `mien export` writes"
+_MAX_MEMBER, _MAX_META = 1 << 26, 1 << 20
+_PALETTE, _SPARE_PIXELS = 1 << 16, 1 << 16
+"""Most rows of coefficients that Gaussians share; and pixels that a picture may have besides two for each Gaussian,
+since other programs round its sides up."""
 
 
 def write_sog(path: Path, gaussians: Gaussians) -> None:
@@ -56,8 +41,6 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
     degrees have the nearest of 256 values; with more than 65,536 Gaussians, similar ones share them. The same Gaussians
     give the same bytes.
     """
-    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
-    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
     means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
     width = max(1, int(np.ceil(np.sqrt(len(means)))))
     logged = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
@@ -96,16 +79,17 @@ def read_sog(path: Path) -> Gaussians:
             if meta["version"] != _VERSION:
                 raise ValueError(f"it has version {meta['version']!r:.20}")
             try:
-                checked_whole(meta["count"], 0, _MAX_GAUSSIANS)
+                checked_whole(meta["count"], 0, MAX_GAUSSIANS)
             except ValueError:
-                most = f"at most {_MAX_GAUSSIANS:,} are read"
+                most = f"at most {MAX_GAUSSIANS:,} are read"
                 raise ValueError(f"it has {meta['count']!r:.20} Gaussians, and {most}") from None
             with np.errstate(over="ignore"):  # infinity is told below
                 arrays = _decoded(members, meta)
-    except _DAMAGE as error:
+    except Exception as error:  # damaged archives and pictures may fail in any way
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path}: cannot be read as .sog ({str(reason)[:100]}); {_REMEDY}") from None
-    gaussians = Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
+        raise UserError(f"{path}: cannot be read as .sog ({str(reason)[:100]}); "
+                        "give a .sog of version 2, as `mien export` writes") from None  # fmt: skip
+    gaussians = gaussians_of(arrays)
     finite_arrays(path, gaussians)
     return gaussians
 
@@ -115,8 +99,8 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
 
     def pixels(part: str, index: int, channels: int) -> np.ndarray:
         data = _member(members, meta[part]["files"][index])
-        size, most = announced_size(data), _MAX_PALETTE if (part, index) == ("shN", 0) else 2 * count + _SPARE_PIXELS
-        if size is None or size[0] * size[1] > most:
+        size, most = announced_size(data), _PALETTE * 15 if (part, index) == ("shN", 0) else 2 * count
+        if size is None or size[0] * size[1] > most + _SPARE_PIXELS:
             raise ValueError(f"{part} has more pixels than its {count:,} Gaussians need")
         with Image.open(io.BytesIO(data)) as picture:
             if picture.size != size:
@@ -160,7 +144,7 @@ def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
         return np.zeros(values.shape, np.uint8), [0.0] * _CODES
     book = np.linspace(flat[0], flat[-1], _CODES)
     sums = np.concatenate([[0], np.cumsum(flat)])
-    for _ in range(_ROUNDS):
+    for _ in range(20):
         ends = np.concatenate([[0], np.searchsorted(flat, (book[1:] + book[:-1]) / 2), [len(flat)]])
         counts = np.diff(ends)
         book = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), book)
@@ -172,7 +156,7 @@ def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
 def _add_palette(pictures: dict[str, bytes], higher: np.ndarray, width: int) -> dict[str, Any]:
     """Add the coefficients of higher degrees to the pictures, and return their part of meta.json."""
     rows = higher.reshape(len(higher), 3 * higher.shape[1])
-    labels = cells_of(rows, 1 << _PALETTE_BITS)
+    labels = cells_of(rows, _PALETTE)
     size = int(labels.max(initial=0)) + 1
     palette, _ = _means(rows, labels, size)
     codes, book = _coded(palette.reshape(size, *higher.shape[1:]))
@@ -237,9 +221,9 @@ def _picture(values: np.ndarray, width: int) -> bytes:
     pixels = np.zeros((height * width, values.shape[1]), np.uint8)
     pixels[: len(values)] = values
     file = io.BytesIO()
-    # Without `exact`, pixels with an alpha of 0 lose their colours.
+    # Without `exact`, pixels with an alpha of 0 lose their colours. More effort takes ten times as long.
     picture = Image.fromarray(pixels.reshape(height, width, -1))
-    picture.save(file, "WEBP", lossless=True, exact=True, quality=_EFFORT, method=2)
+    picture.save(file, "WEBP", lossless=True, exact=True, quality=20, method=2)
     return file.getvalue()
 
 
@@ -247,7 +231,7 @@ def _zipped(members: dict[str, bytes]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, data in members.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+            archive.writestr(zipfile.ZipInfo(name), data)
     return file.getvalue()
 
 
@@ -259,7 +243,7 @@ def _member(members: zipfile.ZipFile, name: str, most: int = _MAX_MEMBER) -> byt
         return file.read(most)
 
 
-def write(path: Path, content: Content, options: Options) -> str:
+def write(path: Path, content: Content, options: SplatOptions) -> str:
     """Write the file, and return what is told of it."""
-    write_sog(path, content.pose())
+    write_sog(path, options.pose(content))
     return pose_words(path, content)

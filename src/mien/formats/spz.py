@@ -9,62 +9,54 @@ import gzip
 import io
 import math
 import struct
-import zlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
-import zstandard
 
 from mien.disk.files import write_atomically
 from mien.disk.reading import read_bytes
 from mien.errors import UserError
-from mien.formats.format import Content, Options, pose_words
-from mien.formats.shared.splats import finite_arrays, unit_quats
-from mien.gaussians import Gaussians
+from mien.formats.format import Content, PoseOptions, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
 
-VERSIONS = (3, 4)
-"""Versions that are written. Version 4 is the current one; some programs read only 3. Version 2 is read as well: its
-quaternions have three bytes."""
+if TYPE_CHECKING:
+    import mien.gaussians
+
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 """Magic number, version, count, degree, bits behind the point, flags, and in version 4 the number of columns."""
 _TABLE_AT, _ENTRY = 32, struct.Struct("<QQ")
 """Where the table of version 4 lies if there are no extensions, and an entry of it: size packed and unpacked, in
 bytes."""
-_ZSTANDARD_LEVEL = 19
-"""A quarter of a second for 40,000 Gaussians, and 3 % smaller than the default."""
-_MAX_FRACTION = 16
-"""Most bits of a position behind the point: steps of 15 micrometres."""
 _FIXED_BITS = 23
 """Bits of a position without its sign."""
 _COLOR_SCALE = 0.15
 _LOG_SCALE_OFFSET, _LOG_SCALE_STEPS = 10, 16
 _SH_STEPS = 128
 _QUAT_STEPS = 511
-_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
-"""Degree of the spherical harmonics by the number of coefficients."""
-_MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
-_REMEDY = "give a .spz of version 2, 3 or 4; `mien export` writes 4"
+_MAX_BYTES = 1 << 28
 
 
-def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> None:
+@dataclass(frozen=True)
+class SpzOptions(PoseOptions):
+    """Options of .spz files."""
+
+    spz_version: Literal[3, 4] = 4
+    """Version of the format. PlayCanvas reads only 4, and older programs only 3."""
+
+
+def write_spz(path: Path, gaussians: "mien.gaussians.Gaussians", version: Literal[3, 4] = 4) -> None:
     """Write unbatched Gaussians in world space as .spz: +x right, +y up, +z to the viewer, in metres.
 
     Positions have steps of 2^-16 m (of more if one is beyond 128 m), scales steps of 6 %, colour coefficients steps of
     0.026 (0.0073 in colour), opacities steps of 1/255, higher coefficients steps of 1/128 within -1 to 1, and rotations
     10 bits for each of the three smallest components. The same Gaussians give the same bytes.
-
-    Args:
-        path: The file.
-        gaussians: The Gaussians.
-        version: Version of the format, 3 or 4.
     """
-    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
-    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
     means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
     reach = float(np.abs(means).max(initial=0))
-    fraction = min(_MAX_FRACTION, math.floor(math.log2((2**_FIXED_BITS - 1) / max(reach, 1e-6))))
+    fraction = min(16, math.floor(math.log2((2**_FIXED_BITS - 1) / max(reach, 1e-6))))
     if fraction < 0:
         raise UserError(f"{path}: a Gaussian is {reach:.3g} m away, too far for .spz; write a .ply")
     fixed = np.round(means.astype(np.float64) * 2**fraction).astype("<i4")
@@ -76,8 +68,7 @@ def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> 
         _packed_quats(unit_quats(quats)),
         _bytes(sh[:, 1:] * _SH_STEPS + _SH_STEPS),
     )
-    assert version in VERSIONS, version
-    parts, facts = [column.tobytes() for column in columns], (len(means), _DEGREES[sh.shape[1]], fraction, 0)
+    parts, facts = [column.tobytes() for column in columns], (len(means), math.isqrt(sh.shape[1]) - 1, fraction, 0)
     if version == 3:
         data = gzip.compress(_HEADER.pack(_MAGIC, version, *facts, 0) + b"".join(parts), mtime=0)
     else:
@@ -85,15 +76,16 @@ def write_spz(path: Path, gaussians: Gaussians, version: int = VERSIONS[-1]) -> 
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
-def read_spz(path: Path) -> Gaussians:
-    """Read a .spz file of version 2, 3 or 4."""
+def read_spz(path: Path) -> "mien.gaussians.Gaussians":
+    """Read a .spz file of version 2 (whose quaternions have three bytes), 3 or 4."""
     try:
         packed = read_bytes(path, _MAX_BYTES)
         read = _read_version_4 if packed[:4] == struct.pack("<I", _MAGIC) else _read_gzip
         fraction, columns = read(packed)
-    except (OSError, EOFError, ValueError, struct.error, zlib.error, zstandard.ZstdError) as error:
+    except Exception as error:  # damaged streams may fail in any way
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path}: cannot be read as .spz ({reason}); {_REMEDY}") from None
+        remedy = "give a .spz of version 2, 3 or 4; `mien export` writes 4"
+        raise UserError(f"{path}: cannot be read as .spz ({reason}); {remedy}") from None
     places, opacities, colors, scales, quats, higher = columns
     count = len(places)
     wide = np.concatenate([np.zeros((count, 3, 1), np.uint8), places], axis=2)
@@ -103,19 +95,17 @@ def read_spz(path: Path) -> Gaussians:
     higher -= _SH_STEPS  # in place: these are most of the numbers
     higher /= _SH_STEPS
     sh = np.concatenate([first[:, None], higher], axis=1)
-    arrays = (
-        means,
-        _unpacked_quats(quats) if quats.shape[1] == 4 else _unpacked_first_three(quats),
-        np.exp(scales.astype(np.float64) / _LOG_SCALE_STEPS - _LOG_SCALE_OFFSET),
-        opacities / 255,
-        sh,
-    )
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
+    quats = _unpacked_quats(quats) if quats.shape[1] == 4 else _unpacked_first_three(quats)
+    scales = np.exp(scales.astype(np.float64) / _LOG_SCALE_STEPS - _LOG_SCALE_OFFSET)
+    return gaussians_of((means, quats, scales, opacities / 255, sh))
 
 
 def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
     """The file of version 4 with these columns."""
-    compressor = zstandard.ZstdCompressor(level=_ZSTANDARD_LEVEL)
+    import zstandard
+
+    # A quarter of a second for 40,000 Gaussians, and 3 % smaller than by the default level.
+    compressor = zstandard.ZstdCompressor(level=19)
     packed = [compressor.compress(part) for part in parts]
     header = _HEADER.pack(_MAGIC, 4, *facts, len(parts)) + struct.pack("<I", _TABLE_AT)
     table = b"".join(_ENTRY.pack(len(small), len(part)) for small, part in zip(packed, parts, strict=True))
@@ -123,13 +113,9 @@ def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
 
 
 def _shapes(count: int, degree: int, quat_bytes: int = 4) -> list[tuple[int, ...]]:
-    """The shapes of all columns.
-
-    Raises:
-        ValueError: there are too many Gaussians.
-    """
-    if count > _MAX_GAUSSIANS:
-        raise ValueError(f"it has {count:,} Gaussians, and at most {_MAX_GAUSSIANS:,} are read")
+    """The shapes of all columns."""
+    if count > MAX_GAUSSIANS:
+        raise ValueError(f"it has {count:,} Gaussians, and at most {MAX_GAUSSIANS:,} are read")
     return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, quat_bytes), (count, (degree + 1) ** 2 - 1, 3)]
 
 
@@ -152,6 +138,8 @@ def _check_header(version: int, known: tuple[int, ...], degree: int, fraction: i
 
 def _read_version_4(packed: bytes) -> tuple[int, list[np.ndarray]]:
     """The number of bits behind the point, and all columns, of a file of version 4."""
+    import zstandard
+
     _, version, count, degree, fraction, _, streams = _HEADER.unpack_from(packed)
     (table,) = struct.unpack_from("<I", packed, _HEADER.size)
     _check_header(version, (4,), degree, fraction)
@@ -220,7 +208,7 @@ def _unpacked_quats(packed: np.ndarray) -> np.ndarray:
     return quats[:, [3, 0, 1, 2]]
 
 
-def write(path: Path, content: Content, options: Options) -> str:
+def write(path: Path, content: Content, options: SpzOptions) -> str:
     """Write the file, and return what is told of it."""
     write_spz(path, content.pose(), options.spz_version)
     return pose_words(path, content)

@@ -9,20 +9,33 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from mien.disk.files import write_atomically
 from mien.disk.reading import open_ordinary
 from mien.errors import UserError
-from mien.formats.format import Content, Options, pose_words
-from mien.formats.shared.splats import finite_arrays, unit_quats
-from mien.gaussians import Gaussians
+from mien.formats.format import Content, PoseOptions, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
 
-USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+if TYPE_CHECKING:
+    import mien.gaussians
+
+_MAX_BYTES = 1 << 28
+_REMEDY = "give a USD file of `mien export`"
+
+
+@dataclass(frozen=True)
+class UsdOptions(PoseOptions):
+    """Options of USD files."""
+
+    def check(self, path: Path) -> None:
+        """Check that usd-core is installed."""
+        super().check(path)
+        check_usd(path)
 
 
 def check_usd(path: Path) -> None:
@@ -31,18 +44,11 @@ def check_usd(path: Path) -> None:
         raise UserError(f"{path}: needs the package usd-core, which is missing; run `pip install 'mien[usd]'`")
 
 
-_ROOT, _SPLATS = "/avatar", "/avatar/gaussians"
-_REACH = 3.0
-"""Standard deviations that the extent has around a centre."""
-_MAX_BYTES, _MAX_GAUSSIANS = 1 << 28, 2_000_000
-_REMEDY = "give a USD file of `mien export`"
-
-
-def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) -> int:
+def write_usd(path: Path, poses: Iterable["mien.gaussians.Gaussians"], fps: float | None = None) -> int:
     """Write unbatched Gaussians in world space (+y up, metres) as a USD stage, and return the number of poses.
 
     Values are float32 and not compressed with loss. With `fps`, each pose is a time sample (0, 1, 2, ...); without it,
-    there is one pose and no time. The ending of `path` chooses the container (`USD_ENDINGS`).
+    there is one pose and no time. The ending of `path` chooses the container: .usd, .usda, .usdc or .usdz.
     """
     check_usd(path)
     Usd, UsdVol = _pxr("Usd", "UsdVol")
@@ -69,12 +75,10 @@ def write_usd(path: Path, poses: Iterable[Gaussians], fps: float | None = None) 
     return count
 
 
-def read_usd(path: Path, time: float | None = None) -> Gaussians:
+def read_usd(path: Path, time: float | None = None) -> "mien.gaussians.Gaussians":
     """Read the Gaussians of a USD file at a time sample (default: without time)."""
     check_usd(path)
     Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
-
-    _check_file(path)
     at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
     try:
         stage = Usd.Stage.Open(_layer_alone(path))
@@ -97,39 +101,29 @@ def read_usd(path: Path, time: float | None = None) -> Gaussians:
     return gaussians
 
 
-def _gaussians_of(values: list[Any]) -> Gaussians:
-    """Gaussians of the attributes of a field.
-
-    Raises:
-        ValueError: their lengths do not fit each other, or there are too many.
-    """
+def _gaussians_of(values: list[Any]) -> "mien.gaussians.Gaussians":
+    """Gaussians of the attributes of a field. A ValueError tells that their lengths do not fit each other."""
     means, turns, scales, opacities, sh = (np.array(value, np.float32) for value in values)
     count = len(means)
     coefficients = len(sh) // max(count, 1)
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count * coefficients, 3))
     if any(array.shape != shape for array, shape in zip((means, turns, scales, opacities, sh), shapes, strict=True)):
         raise ValueError
-    if count > _MAX_GAUSSIANS or (count and coefficients not in (1, 4, 9, 16)):
+    if count > MAX_GAUSSIANS or (count and coefficients not in (1, 4, 9, 16)):
         raise ValueError
-    arrays = (means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(count, coefficients, 3))
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
-
-
-def _check_file(path: Path) -> None:
-    """Refuse what is no ordinary file, or is larger than any head. USD would wait for a pipe."""
-    try:
-        with open_ordinary(path) as file:
-            size = os.fstat(file.fileno()).st_size
-    except (OSError, ValueError):
-        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
-    if path.suffix.lower() not in USD_ENDINGS or size > _MAX_BYTES:
-        raise UserError(f"{path}: has no ending of USD, or more than {_MAX_BYTES:,} bytes; {_REMEDY}")
+    return gaussians_of((means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(count, coefficients, 3)))
 
 
 def _layer_alone(path: Path) -> Any:
     """The layer of a file, if it refers to no other file. A stranger's file could name any on this machine."""
     (Sdf,) = _pxr("Sdf")
-
+    try:
+        with open_ordinary(path) as file:  # USD would wait for a pipe
+            size = os.fstat(file.fileno()).st_size
+    except (OSError, ValueError):
+        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
+    if path.suffix.lower() not in (".usd", ".usda", ".usdc", ".usdz") or size > _MAX_BYTES:
+        raise UserError(f"{path}: has no ending of USD, or more than {_MAX_BYTES:,} bytes; {_REMEDY}")
     layer = Sdf.Layer.FindOrOpen(str(path.absolute()))
     if layer is None:
         raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
@@ -161,17 +155,17 @@ def _usd_errors() -> Iterator[None]:
         raise OSError(code, os.strerror(code)) from None
 
 
-def _write_stage(path: Path, file: Path, poses: Iterable[Gaussians], fps: float | None) -> int:
+def _write_stage(path: Path, file: Path, poses: Iterable["mien.gaussians.Gaussians"], fps: float | None) -> int:
     """Write the poses into `file`, and return their number. Messages name `path`."""
     Usd, UsdGeom, UsdVol = _pxr("Usd", "UsdGeom", "UsdVol")
 
     stage = Usd.Stage.CreateNew(str(file))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    root = UsdGeom.Xform.Define(stage, _ROOT)
+    root = UsdGeom.Xform.Define(stage, "/avatar")
     stage.SetDefaultPrim(root.GetPrim())
     Usd.ModelAPI(root.GetPrim()).SetKind("component")
-    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _SPLATS)
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/avatar/gaussians")
     count = 0
     for count, gaussians in enumerate(poses, 1):  # noqa: B007
         _add_pose(path, field, gaussians, None if fps is None else float(count - 1))
@@ -185,11 +179,7 @@ def _write_stage(path: Path, file: Path, poses: Iterable[Gaussians], fps: float 
 
 
 def _write_package(stage: Path, package: Path) -> None:
-    """Write the package of a stage's file.
-
-    Raises:
-        OSError: the package is not whole. USD gives no reason, and the usual one is a full disk.
-    """
+    """Write the package of a stage's file. USD gives no reason if it is not whole; the usual one is a full disk."""
     Sdf, UsdUtils = _pxr("Sdf", "UsdUtils")
 
     whole = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(stage)), str(package))
@@ -202,16 +192,14 @@ def _write_package(stage: Path, package: Path) -> None:
         raise OSError(errno.ENOSPC, "its package is incomplete")
 
 
-def _add_pose(path: Path, field: Any, gaussians: Gaussians, time: float | None) -> None:
+def _add_pose(path: Path, field: Any, gaussians: "mien.gaussians.Gaussians", time: float | None) -> None:
     Usd, Vt = _pxr("Usd", "Vt")
 
-    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
-    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
     means, quats, scales, opacities, sh = finite_arrays(path, gaussians)
     at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
     degree = math.isqrt(sh.shape[1]) - 1
     turns = np.ascontiguousarray(unit_quats(quats)[:, [1, 2, 3, 0]])  # USD keeps the real part last in memory
-    reach = _REACH * scales.max(1, keepdims=True)
+    reach = 3 * scales.max(1, keepdims=True)  # in standard deviations
     extent = np.stack([(means - reach).min(0), (means + reach).max(0)]) if len(means) else np.zeros((2, 3), np.float32)
     field.CreatePositionsAttr().Set(Vt.Vec3fArray.FromNumpy(means), at)
     field.CreateOrientationsAttr().Set(Vt.QuatfArray.FromNumpy(turns), at)
@@ -226,11 +214,12 @@ def _add_pose(path: Path, field: Any, gaussians: Gaussians, time: float | None) 
         field.CreateSortingModeHintAttr().Set("zDepth")
 
 
-def write(path: Path, content: Content, options: Options) -> str:
+def write(path: Path, content: Content, options: UsdOptions) -> str:
     """Write the file, and return what is told of it."""
     moving = content.poses()
     if moving is None:
         write_usd(path, [content.pose()])
         return pose_words(path, content)
-    count = write_usd(path, *moving)
+    frames, fps = moving
+    count = write_usd(path, (frame.pose() for frame in frames), fps)
     return f"{count} time samples, {path.stat().st_size / 1e6:.1f} MB"

@@ -8,13 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from mien import runtime
-from mien.formats.format import Content, Options
-from mien.formats.glb import TEXTURE_SIZE, Head, MeshModel, WrittenGlb, head_of
-from mien.media.picture_files import encode_picture
+from mien.formats.format import Content, NoOptions
+from mien.formats.glb import TEXTURE_SIZE, Head, MeshModel, head_of
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.named import GAZE_NAMES, LOOK_ANGLE, presets, visemes, within_lids
 
@@ -46,8 +44,6 @@ BODY: dict[str, tuple[str | None, tuple[float, float, float]]] = {
 the right side mirror those of the left. A person of 1.7 m has about these lengths."""
 _HEAD = ("spine", (0, 0.55, 0.01))
 _EYES = {"leftEye": "left_eye", "rightEye": "right_eye"}
-_THUMBNAIL = 512
-"""Side of the picture that programs show of the file, in pixels."""
 _EMOTIONS = {"happy": "smile", "angry": "anger", "sad": "sadness", "surprised": "surprise"}
 """VRM's emotions, and the presets of mien that they are."""
 _RELAXED = {
@@ -66,17 +62,24 @@ _LOOKS = {
 }
 
 
-def write_vrm(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int = TEXTURE_SIZE) -> WrittenGlb:
-    """Write an avatar as one .vrm file of VRM 1.0, which faces +z, in metres. The same input gives the same bytes."""
+def write_vrm(
+    path: Path, avatar: PortableAvatar, model: MeshModel, texture_size: int = TEXTURE_SIZE
+) -> tuple[str, ...]:
+    """Write an avatar as one .vrm file of VRM 1.0, which faces +z, in metres, and return the names of the expressions.
+
+    The same input gives the same bytes.
+    """
     head = head_of(path, avatar, model, texture_size)
     about, content = avatar.about, head.content
     bones = _add_body(content)
+    person = runtime.Avatar(avatar).render(camera=avatar.camera.square(512), background=(1, 1, 1))[0]
+    content["images"].append({"name": "thumbnail", **head.writer.jpeg(person.clip(0, 1), 90)})
     meta = {
         "name": about.name,
         "authors": [about.name],
         "licenseUrl": LICENCE,
         "thirdPartyLicenses": f"Face model {about.face_model}: {about.licence}",
-        "thumbnailImage": _add_thumbnail(head, avatar),
+        "thumbnailImage": 1,
         **PERMISSIONS,
     }
     content |= {
@@ -94,7 +97,8 @@ def write_vrm(path: Path, avatar: PortableAvatar, model: MeshModel, texture_size
             }
         },
     }
-    return head.write(path)
+    head.writer.write(path, content)
+    return head.targets
 
 
 def expressions(targets: tuple[str, ...]) -> dict[str, dict[str, Any]]:
@@ -157,16 +161,8 @@ def _look_at(head: Head, bones: dict[str, dict[str, int]]) -> dict[str, Any]:
     }
 
 
-def _add_thumbnail(head: Head, avatar: PortableAvatar) -> int:
-    """Add a picture of the person at rest over white, and return its index."""
-    drawn = runtime.Avatar(avatar)
-    picture = drawn.render(camera=avatar.camera.square(_THUMBNAIL), background=(1, 1, 1))[0]
-    data = encode_picture((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8), ".jpeg", (cv2.IMWRITE_JPEG_QUALITY, 90))
-    head.content["images"].append({"name": "thumbnail", "mimeType": "image/jpeg", "bufferView": head.writer.view(data)})
-    return len(head.content["images"]) - 1
-
-
-def write(path: Path, content: Content, options: Options) -> str:
+def write(path: Path, content: Content, options: NoOptions) -> str:
     """Write the file, and return what is told of it."""
-    written = write_vrm(path, content.portable(), content.mesh())
-    return f"a mesh with {len(written.targets)} expressions in VRM 1.0, {written.size / 1e6:.1f} MB"
+    mesh = content.mesh()
+    targets = write_vrm(path, content.portable(), mesh)
+    return f"a mesh with {len(targets)} expressions in VRM 1.0, {path.stat().st_size / 1e6:.1f} MB"

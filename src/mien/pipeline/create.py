@@ -10,11 +10,12 @@ from mien.disk.files import write_atomically
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.evaluation.living import FILM, living, write_film
+from mien.formats.format import MotionOptions
 from mien.formats.page import write_page
 from mien.formats.shared.packed import Motion
 from mien.machine.progress import say
 from mien.pages.pages import LIVING_PAGE
-from mien.pipeline.export import RunContent, Series
+from mien.pipeline.export_run import RunContent
 from mien.training.footage.filmed import read_coverage
 from mien.training.run import read_run_config, run_camera
 
@@ -49,7 +50,7 @@ def show_page(workspace: Workspace, run: str) -> None:
     """
     root, run_dir = workspace.root, workspace.run_dir(run)
     try:
-        content = RunContent(workspace, run, (), Series(read_run_config(run_dir)["data"][0]["sequence"]))
+        content = RunContent(workspace, run, MotionOptions(read_run_config(run_dir)["data"][0]["sequence"]))
         page = write_page(
             root / LIVING_PAGE, content.portable(confidence=False, soft_cut=True), _first_seconds(content.motion())
         )

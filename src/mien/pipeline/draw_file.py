@@ -25,7 +25,10 @@ def render_file(
 ) -> None:
     """Draw the avatar in a file along a camera path."""
     avatar = runtime.load(source)
-    gaussians = _posed(avatar, assignments)
+    portable, rest = avatar.portable, avatar.portable.neutral
+    bounds, model = portable.expression_bounds.tolist(), portable.about.face_model
+    settable = Settable(avatar.expression_names, bounds, avatar.joint_names, model)
+    gaussians = avatar.pose(*assign(assignments, settable, rest.expression, rest.joints))
     cameras = view.cameras(avatar, options)
 
     def picture(camera: runtime.Camera) -> UInt8[np.ndarray, "h w _"]:
@@ -53,17 +56,6 @@ class View:
         zoom = zoom_at_rest(avatar, options.shape()) if self._zoom is None else self._zoom
         camera = fitted(avatar.camera, *options.shape(), zoom)
         return self._path(turned(camera, center, self._yaw, self._pitch), center)
-
-
-def _posed(avatar: runtime.Avatar, assignments: Sequence[str]) -> runtime.Gaussians:
-    """The person at rest with what `--set` asks for."""
-    portable = avatar.portable
-    settable = Settable(
-        avatar.expression_names, portable.expression_bounds.tolist(), avatar.joint_names, portable.about.face_model
-    )
-    neutral = portable.neutral
-    expression, joints = assign(assignments, settable, neutral.expression, neutral.joints)
-    return avatar.pose(expression, joints)
 
 
 def _write(output: Output, pictures: Iterable[np.ndarray], fps: float) -> None:

@@ -1,145 +1,65 @@
-"""The content that `mien export` writes of a run: its avatar, poses and motions. Avatars of files: `convert`."""
+"""`mien export`: an avatar is written in a format. Whole avatars that come from a file are written without torch."""
 
-from collections.abc import Iterator
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
+from mien import runtime
+from mien.formats.format import Content, Format, NoOptions
+from mien.formats.registry import format_of, numbered
+from mien.machine.progress import say
+from mien.runtime.baked import PortableAvatar
 
-from mien.avatar.avatar import Avatar
-from mien.avatar.baking import as_array, bake_rig, make_portable
-from mien.avatar.files import load_avatar
-from mien.disk.workspace import Workspace
-from mien.driving.rest import facing, rest_of
-from mien.driving.transfer import drive
-from mien.face.params import FaceParams
-from mien.formats.format import Format, Options
-from mien.formats.glb import MeshModel
-from mien.formats.registry import numbered
-from mien.formats.shared.packed import Motion
-from mien.formats.shared.world_space import in_world
-from mien.gaussians import Gaussians
-from mien.machine.progress import say, track_progress
-from mien.pipeline.drive import open_driver
-from mien.pipeline.expression import with_expression
-from mien.runtime.baked import MeshBound, PortableAvatar
-from mien.training.footage.filmed import read_coverage
-from mien.training.run import read_face_track, run_camera
-from mien.training.whole_head.soft_cut import with_soft_cut
+if TYPE_CHECKING:
+    import mien.gaussians
 
 
-@dataclass(frozen=True)
-class Series:
-    """A motion that is exported."""
+def export(content: Content, out: Path, kind: Format, options: NoOptions) -> None:
+    """Write an avatar in a format, and tell of it. A motion is numbered files if a file holds one pose."""
+    frames = content.poses() if kind.holds == "pose" else None
+    if frames is None:
+        first, *notes = kind.write(out, content, options).splitlines()
+        for line in (f"{out}: {first}", *notes):
+            say(line)
+        return
+    written = []
+    for index, frame in enumerate(frames[0]):
+        written.append(numbered(out, index))
+        kind.write(written[-1], frame, options)
+    say(f"{written[0]} ... {written[-1].name}: {len(written)} files")
 
-    by: str
-    """Name of a sequence of the workspace, or anything that `mien drive --by` takes."""
-    neutral: str | None = None
-    """The driver's face at rest, as for `mien drive`."""
-    every: int = 1
-    """Only every n-th frame is taken."""
 
+class FileContent(Content):
+    """An avatar that comes from a file, at rest, as `mien.formats.Content`."""
 
-class RunContent:
-    """The avatar of a run, as `mien.formats.Content`."""
-
-    def __init__(self, workspace: Workspace, run: str, expression: tuple[str, ...] = (), series: Series | None = None):
-        """Load the avatar.
-
-        Args:
-            workspace: The workspace.
-            run: Name of the run.
-            expression: Settings of the face, NAME=VALUE, on top of the person's neutral and of the series.
-            series: The motion, if there is one.
-        """
-        self._workspace, self._run_dir = workspace, workspace.run_dir(run)
-        self._expression, self._series = expression, series
-        self._avatar = load_avatar(self._run_dir)
-        self._still: Gaussians | None = None
-
-    def still(self, gaussians: Gaussians) -> "RunContent":
-        """Return a copy whose pose is a frame of the series."""
-        content = copy(self)
-        content._still = gaussians
-        return content
+    def __init__(self, source: Path):
+        """Read the file."""
+        kind = format_of(source)
+        assert kind is not None
+        assert kind.read is not None
+        self._avatar = kind.read(source)
 
     @property
     def count(self) -> int:
         """Number of Gaussians."""
-        return len(self._avatar.gaussian_store())
+        return len(self._posed())
 
     def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
-        """Return the whole avatar, with everything that the run knows of it."""
-        name = self._workspace.root.resolve().name
-        portable = make_portable(self._avatar, run_camera(self._run_dir), name)
-        if soft_cut:
-            portable = with_soft_cut(portable, self._avatar)
-        covered = read_coverage(self._run_dir, self._avatar.face_model) if confidence else None
-        return portable if covered is None else replace(portable, confidence=as_array(covered.seen))
+        """Return the avatar as it was read."""
+        return self._avatar
 
-    def mesh(self) -> MeshModel:
-        """Return the mesh that the Gaussians are bound to, or else the person's, with its texture coordinates."""
-        model, baked = self._avatar.face_model, self._avatar.bake()
-        rig = baked.rig if isinstance(baked, MeshBound) else bake_rig(model, self._avatar.subject)
-        return MeshModel(rig, *map(as_array, (model.faces, model.uv, model.uv_faces)))
+    def pose(self) -> "mien.gaussians.Gaussians":
+        """Return the Gaussians. This needs torch."""
+        import torch
 
-    def pose(self) -> Gaussians:
-        """Return the Gaussians with the expression that was asked for, or of the frame (`still`)."""
-        if self._still is not None:
-            return self._still
-        return self._posed(with_expression(self._avatar.subject, self._avatar.face_model, self._expression))
+        from mien.formats.shared.splats import gaussians_of
+        from mien.formats.shared.world_space import in_world
 
-    def poses(self) -> tuple[Iterator[Gaussians], float] | None:
-        """Return the Gaussians of every frame of the series, and frames per second."""
-        if self._series is None:
-            return None
-        driven, fps = self._driven(self._series, with_head_pose=False)
-        indices = track_progress(range(len(driven)), "Exporting", len(driven))
-        return (self._posed(driven[index]) for index in indices), fps
+        posed = self._posed()
+        pose = None if posed.T_world_local is None else torch.from_numpy(posed.T_world_local)
+        still = gaussians_of((posed.means, posed.quats, posed.scales, posed.opacities, posed.sh))
+        return in_world(replace(still, T_world_local=pose))
 
-    def motion(self) -> Motion | None:
-        """Return the series as face parameters with head poses."""
-        if self._series is None:
-            return None
-        driven, fps = self._driven(self._series, with_head_pose=True)
-        fields = (driven.expression, driven.joints, driven.head_rotation, driven.head_translation)
-        return Motion(*(tensor.detach().float().numpy() for tensor in fields), fps=fps)
-
-    def trained(self) -> tuple[Avatar, FaceParams]:
-        """Return the trained avatar, and the person at all timesteps of its training."""
-        face, subject = read_face_track(self._run_dir, self._avatar.face_model), self._avatar.subject
-        return self._avatar, replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
-
-    def _driven(self, series: Series, with_head_pose: bool) -> tuple[FaceParams, float]:
-        """The face parameters of the series for this avatar, and frames per second."""
-        model, subject = self._avatar.face_model, self._avatar.subject
-        own = series.by in self._workspace.sequence_names()
-        by = self._workspace.root if own else Path(series.by)
-        driver = open_driver(by, series.by if own else None, model, neutral=series.neutral)
-        person = rest_of(subject, model, facing(run_camera(self._run_dir).viewmat)).face
-        driven = drive(driver.face, driver.at_rest, person, model.expression_bounds, with_head_pose, series.by)
-        return with_expression(driven[:: series.every], model, self._expression), driver.fps / series.every
-
-    def _posed(self, face: FaceParams) -> Gaussians:
-        """The Gaussians of one timestep in the world. The head is at the origin, +y up, +z out of the face."""
-        origin = torch.zeros_like(face.head_rotation)
-        posed = self._avatar.pose(replace(face, head_rotation=origin, head_translation=origin))
-        return in_world(posed.gaussians.detach().timestep(0))
-
-
-def export(content: RunContent, out: Path, kind: Format, options: Options) -> None:
-    """Write the avatar of a run in a format, and tell of it. A motion is numbered files if a file holds one pose."""
-    moving = content.poses() if kind.holds == "pose" else None
-    if moving is None:
-        say(f"{out}: reads the run and writes the file, which takes up to half a minute")
-        first, *notes = kind.write(out, content, options).splitlines()
-        say(f"{out}: {first}")
-        for note in notes:
-            say(note)
-        return
-    written = []
-    for index, gaussians in enumerate(moving[0]):
-        written.append(numbered(out, index))
-        kind.write(written[-1], content.still(gaussians), options)
-    say(f"{written[0]} ... {written[-1].name}: {len(written)} files")
+    def _posed(self) -> runtime.Gaussians:
+        """The Gaussians with the head at the origin."""
+        return runtime.Avatar(self._avatar).pose(head_rotation=(0, 0, 0), head_translation=(0, 0, 0))

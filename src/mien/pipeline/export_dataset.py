@@ -1,4 +1,4 @@
-"""A tracked sequence of a workspace in the layout of another laboratory, as `mien export --format` writes it."""
+"""A tracked sequence in the layout of another laboratory, and the videos of a benchmark: `mien export-dataset`."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -74,18 +74,11 @@ def export_capture(
     say(f"{out}: {write_layout(out, filmed, layout)}")
 
 
-_CRF = 14
-"""Quality of the videos, as the benchmark asks for."""
-
-
 def export_submission(workspace: Workspace, run: str, person: Path, out: Path) -> None:
     """Render a run for the benchmark into OUT/PERSON, and report what a submission still lacks.
 
-    Args:
-        workspace: The workspace of the run.
-        run: Name of the run.
-        person: The person's folder of the benchmark, with calibration and trackings. Its name is a number.
-        out: The submission folder. Folders of other people may be in it.
+    `person` is the person's folder of the benchmark, with calibration and trackings, whose name is a number. Folders of
+    other people may be in `out`.
     """
     number, run_dir = person.resolve().name.zfill(3), workspace.run_dir(run)
     avatar = load_avatar(run_dir)
@@ -135,10 +128,10 @@ def _write(folder: Path, task: Task, avatar: Avatar) -> None:
     subject = avatar.subject
     face = replace(task.face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
     for serial, camera in task.cameras.items():
-        path = folder / task.sequence / f"cam_{serial}.mp4"
+        path, title = folder / task.sequence / f"cam_{serial}.mp4", f"{task.sequence}, camera {serial}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        title = f"{task.sequence}, camera {serial}"
-        write_video(path, track_progress(_pictures(avatar, face, camera, title), title, len(face)), task.fps, _CRF)
+        pictures = track_progress(_pictures(avatar, face, camera, title), title, len(face))
+        write_video(path, pictures, task.fps, 14)  # the quality that the benchmark asks for
 
 
 @torch.no_grad()

@@ -32,7 +32,7 @@ class Layout:
     """A layout of files. Its writer is the function `write` of the file in this folder that has its name."""
 
     name: str
-    """Name for `mien export --format`."""
+    """Name for `mien export-dataset --format`."""
     about: str
     """The programs that read it, in a few words."""
     one_camera: bool = True

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.disk.files import write_atomically
-from mien.disk.inside import open_to_read
-from mien.disk.limits import MAX_NUMBER
+from mien.disk.limits import MAX_NUMBER, is_moderate
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
@@ -32,7 +31,6 @@ _PER_FRAME = {"expr": None, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_
 _WANTED = (*_PER_FRAME, "shape", "static_offset", "dynamic_offset")
 TEETH = (5023, 5143)
 """Vertices of FLAME, without and with the teeth that GaussianAvatars adds. Trackings may lack offsets of the teeth."""
-_MAX_TIMESTEPS = 1_000_000
 _REMEDY = "give flame_param.npz as GaussianAvatars or `mien export` wrote it"
 
 
@@ -51,13 +49,7 @@ def write_flame_params(path: Path, face_model: FaceModel, face: FaceParams) -> N
 
 @torch.no_grad()
 def flame_params_of(path: Path, face_model: FaceModel, face: FaceParams) -> dict[str, np.ndarray]:
-    """Return the arrays of flame_param.npz for t timesteps, the inverse of `face_of_flame_params`.
-
-    Args:
-        path: The file or folder that they are for, for messages.
-        face_model: The face model of the parameters.
-        face: The subject at t timesteps.
-    """
+    """Return the arrays of flame_param.npz for t timesteps, the inverse of `face_of_flame_params`."""
     free = face_model.free_joint_names
     others = set(free) - {name for names in _POSES.values() for name in names}
     if others:
@@ -85,18 +77,20 @@ def flame_params_of(path: Path, face_model: FaceModel, face: FaceParams) -> dict
 @torch.no_grad()
 def read_flame_params(path: Path, face_model: FaceModel) -> FaceParams:
     """Read flame_param.npz as parameters of a face model. Nothing in it is run, and its size is limited."""
-    return face_of_flame_params(path, _read_arrays(path), face_model)
+    try:
+        arrays = read_npz(path, _WANTED)[1]
+    except Exception as error:  # a damaged archive may fail in any way
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: cannot be read as .npz ({reason}); {_REMEDY}") from None
+    return face_of_flame_params(path, arrays, face_model)
 
 
 @torch.no_grad()
 def face_of_flame_params(path: Path, arrays: Mapping[str, np.ndarray], face_model: FaceModel) -> FaceParams:
     """Return parameters of a face model from arrays with the names and shapes of flame_param.npz.
 
-    Args:
-        path: The file or folder that they come from, for messages.
-        arrays: `shape` [n], `expr` [t, e], `rotation`, `translation`, `neck_pose` and `jaw_pose` [t, 3], `eyes_pose`
-            [t, 6] (left, then right), and perhaps `static_offset` [1, v, 3].
-        face_model: The face model that they belong to.
+    These are `shape` [n], `expr` [t, e], `rotation`, `translation`, `neck_pose` and `jaw_pose` [t, 3], `eyes_pose`
+    [t, 6] (left, then right), and perhaps `static_offset` [1, v, 3]. Messages name `path`.
     """
     arrays = _checked(path, arrays)
     v = len(face_model.template)
@@ -114,33 +108,16 @@ def face_of_flame_params(path: Path, arrays: Mapping[str, np.ndarray], face_mode
     return face
 
 
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The wanted arrays of the file."""
-    try:
-        open_to_read(path).close()
-        return read_npz(path, _WANTED)[1]
-    except UserError:
-        raise
-    except FileNotFoundError:
-        raise UserError(
-            f"{path}: is missing, and without it Gaussians in the frames of triangles have no place; copy it beside "
-            "point_cloud.ply"
-        ) from None
-    except Exception as error:  # a damaged archive may fail in any way
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path}: cannot be read as .npz ({reason}); {_REMEDY}") from None
-
-
 def _checked(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays as float32, with their numbers and axes checked."""
     for name in ("shape", *_PER_FRAME):
         if name not in arrays:
             raise UserError(f"{path}: has no {name!r}; {_REMEDY}")
     for name, array in arrays.items():
-        if array.size and not np.abs(array).max() <= MAX_NUMBER:
+        if not is_moderate(array):
             raise UserError(f"{path}: {name!r} holds NaN or numbers beyond {MAX_NUMBER:g}; {_REMEDY}")
     t = len(arrays["expr"]) if arrays["expr"].ndim == 2 else 0
-    if not 0 < t <= _MAX_TIMESTEPS:
+    if not 0 < t <= 1_000_000:
         raise UserError(f"{path}: 'expr' has the shape {list(arrays['expr'].shape)}, not [timesteps, n]; {_REMEDY}")
     for name, columns in _PER_FRAME.items():
         wanted = [t, columns or arrays["expr"].shape[1]]

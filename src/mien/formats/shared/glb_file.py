@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from mien.disk.files import write_atomically
-from mien.disk.limits import checked_whole
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
 
@@ -18,8 +18,6 @@ _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _MAX_BYTES = 1 << 28
 """Largest file that is read, in bytes. The largest that mien writes has some tens of megabytes."""
 _MAX_JSON_BYTES = 32 << 20
-_MAX_ROWS = 1 << 24
-"""Most rows of an accessor. One that is sparse may be larger than its bytes."""
 _COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("<u2"): 5123, np.dtype("u1"): 5121}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 VERTICES, INDICES = 34962, 34963
@@ -50,11 +48,8 @@ class GlbWriter:
     ) -> int:
         """Add an array [n] or [n, c], and return the index of its accessor.
 
-        Args:
-            array: The values; their dtype becomes the component type.
-            target: Use of the buffer view.
-            bounds: Whether to state the least and the largest value of each component, as positions need it.
-            normalized: Whether integers mean 0 to 1.
+        With `bounds`, the least and the largest value of each component are stated, as positions need it; `normalized`
+        integers mean 0 to 1.
         """
         view = self.view(np.ascontiguousarray(array).tobytes(), target)
         described = {"bufferView": view, **self._described(array, bounds)}
@@ -77,6 +72,16 @@ class GlbWriter:
         self.accessors.append(described)
         return len(self.accessors) - 1
 
+    def jpeg(self, colors: Float32[np.ndarray, "h w 3"], quality: int) -> dict[str, Any]:
+        """Add a picture of colours 0 to 1, and return its description as an image. This needs OpenCV."""
+        import cv2
+
+        from mien.media.picture_files import encode_picture
+
+        picture = (colors * 255 + 0.5).astype(np.uint8)
+        data = encode_picture(picture, ".jpeg", (cv2.IMWRITE_JPEG_QUALITY, quality))
+        return {"mimeType": "image/jpeg", "bufferView": self.view(data)}
+
     @staticmethod
     def _described(array: np.ndarray, bounds: bool) -> dict[str, Any]:
         width = int(np.prod(array.shape[1:], dtype=int))
@@ -90,13 +95,8 @@ class GlbWriter:
             described |= {"min": flat.min(0).tolist(), "max": flat.max(0).tolist()}
         return described
 
-    def write(self, path: Path, content: dict[str, Any]) -> int:
-        """Write the file atomically, and return its size in bytes.
-
-        Args:
-            path: The file.
-            content: The json, without accessors, bufferViews and buffers.
-        """
+    def write(self, path: Path, content: dict[str, Any]) -> None:
+        """Write the file. `content` is its json without accessors, bufferViews and buffers."""
         whole = {
             **content,
             "accessors": self.accessors,
@@ -114,7 +114,6 @@ class GlbWriter:
             *self._pieces,
         ]
         write_atomically(path, lambda temporary: temporary.write_bytes(b"".join(parts)))
-        return size
 
 
 @dataclass(frozen=True)
@@ -125,47 +124,13 @@ class Glb:
     """Its json."""
     buffer: bytes
 
-    def array(self, accessor: int) -> np.ndarray:
-        """The values of an accessor: [n], or [n, c].
-
-        Raises:
-            ValueError: it is incomplete, has too many rows, or reaches beyond the buffer.
-        """
-        try:
-            return self._array(accessor)
-        except (LookupError, TypeError, AttributeError, StopIteration, OverflowError) as error:
-            raise ValueError(f"accessor {accessor} is damaged ({repr(error)[:80]})") from None
-
-    def _array(self, accessor: int) -> np.ndarray:
-        described = self.content["accessors"][accessor]
-        width = next(width for width, name in _TYPES.items() if name == described["type"])
-        kind = self._kind(described["componentType"])
-        shape = (checked_whole(described["count"], 0, _MAX_ROWS), width)
-        if "bufferView" in described:
-            values = np.frombuffer(self.bytes_of(described["bufferView"]), kind).reshape(shape).copy()
-        else:
-            values = np.zeros(shape, kind)
-        if "sparse" in described:
-            rows, changed = described["sparse"]["indices"], described["sparse"]["values"]
-            index = np.frombuffer(self.bytes_of(rows["bufferView"]), self._kind(rows["componentType"]))
-            values[index] = np.frombuffer(self.bytes_of(changed["bufferView"]), kind).reshape(-1, width)
-        return values[:, 0] if width == 1 else values
-
     def bytes_of(self, view: int) -> bytes:
-        """The bytes of a buffer view.
-
-        Raises:
-            ValueError: it reaches beyond the buffer.
-        """
+        """The bytes of a buffer view. One that reaches beyond the buffer is a ValueError."""
         described = self.content["bufferViews"][view]
         start, size = described.get("byteOffset", 0), described["byteLength"]
         if view < 0 or start < 0 or size < 0 or start + size > len(self.buffer):
             raise ValueError(f"buffer view {view} reaches beyond the buffer")
         return self.buffer[start : start + size]
-
-    @staticmethod
-    def _kind(component: int) -> np.dtype:
-        return next(kind for kind, number in _COMPONENTS.items() if number == component)
 
 
 def read_glb(path: Path) -> Glb:

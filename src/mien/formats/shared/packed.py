@@ -9,18 +9,28 @@ import json
 import struct
 import zlib
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from mien.errors import UserError
-from mien.formats.shared.bound_features import bound_features
-from mien.formats.shared.rows import with_rows
-from mien.runtime.baked import BlendSkinned, MeshBound, PortableAvatar, Static
+from mien.runtime.baked import (
+    BakedAvatar,
+    BlendSkinned,
+    ExpressionChanges,
+    FeatureChanges,
+    MeshBound,
+    PortableAvatar,
+    Rig,
+    Static,
+)
 from mien.runtime.posing import Face
 
+Baked = TypeVar("Baked", bound=BakedAvatar)
 FORMAT, VERSION = "mien.packed", 1
+_UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
+"""A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +154,68 @@ def _prepared(avatar: PortableAvatar) -> PortableAvatar:
             return avatar
 
 
+def bound_features(avatar: PortableAvatar, baked: Static) -> MeshBound | None:
+    """Static Gaussians with a network of features as features on one triangle that never moves. They look the same.
+
+    GPUs run such networks of bound Gaussians; pages run those of others on the processor. None if their changes are not
+    those of `FeatureChanges`: another network, linear bases, or colours that depend on the view.
+    """
+    network = baked.network
+    if (
+        network is None
+        or network.along is None
+        or baked.bases is not None
+        or len(network.weights) != 2
+        or network.activation != "leaky_relu"
+        or network.outputs != ("sh", "opacity_logits")
+        or baked.attributes.sh.shape[1] != 1
+    ):
+        return None
+    along = network.along
+    width = along.basis.shape[2]
+    changes = ExpressionChanges(
+        rest=along.rest,
+        directions=along.directions,
+        seen=np.empty((0, along.directions.shape[1]), np.float32),
+        features=FeatureChanges(
+            neutral=np.ascontiguousarray(network.base[:, :width]),
+            basis=along.basis,
+            own=np.ascontiguousarray(network.base[:, width:]),
+            weights=network.weights,
+            biases=network.biases,
+        ),
+    )
+    return MeshBound(
+        rig=_still_rig(avatar),
+        faces=np.array([[0, 1, 2]], np.int32),
+        face_index=np.zeros(len(baked.means), np.int32),
+        means=baked.means,
+        attributes=baked.attributes,
+        sh_frame="head",
+        changes=changes,
+    )
+
+
+def _still_rig(avatar: PortableAvatar) -> Rig:
+    """One triangle on a root joint. The face's joints are there, and move nothing."""
+    e, names = len(avatar.expression_names), ("root", *avatar.joint_names)
+    k = len(names)
+    weights = np.zeros((3, k), np.float32)
+    weights[:, 0] = 1
+    return Rig(
+        template=_UNIT_FRAME,
+        expression_names=avatar.expression_names,
+        expression_basis=np.zeros((e, 3, 3), np.float32),
+        joint_names=names,
+        joint_parents=(-1, *(0 for _ in avatar.joint_names)),
+        joint_free=(False, *(True for _ in avatar.joint_names)),
+        joint_template=np.zeros((k, 3), np.float32),
+        joint_rotation_basis=np.zeros((e, k, 3), np.float32),
+        joint_translation_basis=np.zeros((e, k, 3), np.float32),
+        skinning_weights=weights,
+    )
+
+
 def _ordered(baked: MeshBound) -> MeshBound:
     """The same Gaussians in the order of their triangles, with unit rotations, and without invisible differences."""
     order = np.argsort(baked.face_index, kind="stable")
@@ -170,15 +242,10 @@ def _check_colors(baked: BlendSkinned | Static, name: str) -> None:
         )
 
 
-def _grouped(array: np.ndarray, code: _Code) -> np.ndarray:
-    """The array as float64, one row for each index of the first axis, or for each index of all others together."""
-    rows = array.astype(np.float64).reshape(len(array), -1)
-    return rows if code.axis == "first" else rows.T
-
-
 def _quantise(array: np.ndarray, code: _Code) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Integers by group, and each group's middle and step."""
-    rows, most = _grouped(array, code), code.levels or 2 ** (code.bits - 1) - 1
+    """Integers by group, an index of the first axis or of all others together, and each group's middle and step."""
+    rows, most = array.astype(np.float64).reshape(len(array), -1), code.levels or 2 ** (code.bits - 1) - 1
+    rows = rows if code.axis == "first" else rows.T
     low, high = rows.min(1, initial=np.inf), rows.max(1, initial=-np.inf)
     low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
     middle = np.zeros(len(rows)) if code.signed else (low + high) / 2
@@ -239,3 +306,43 @@ def _coded(value: Any, path: str) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{f.name: _coded(getattr(value, f.name), f"{path}.{f.name}") for f in fields(value)})
     return value
+
+
+def with_rows(baked: Baked, rows: Int[np.ndarray, " k"]) -> Baked:
+    """A baked avatar with the Gaussians of these indices alone, in the order of the indices."""
+    attributes = _rows(baked.attributes, rows, *(field.name for field in fields(baked.attributes)))
+    match baked:
+        case MeshBound():
+            changes = _rows(baked.changes, rows, "color", "opacity_logits", "means")
+            if changes is not None:
+                changes = replace(changes, features=_rows(changes.features, rows, "neutral", "basis", "own"))
+            face_index, means = baked.face_index[rows], baked.means[rows]
+            return replace(baked, face_index=face_index, means=means, attributes=attributes, changes=changes)
+        case Static():
+            bases, network = _bases(baked, rows), _network(baked, rows)
+            return replace(baked, means=baked.means[rows], attributes=attributes, bases=bases, network=network)
+        case BlendSkinned():
+            own = ("expression_basis", "pose_basis")
+            rig = _rows(baked.rig, rows, "template", "skinning_weights", second=own)
+            still = None if baked.still_weights is None else baked.still_weights[rows]
+            bases, network = _bases(baked, rows), _network(baked, rows)
+            return replace(baked, rig=rig, attributes=attributes, bases=bases, network=network, still_weights=still)
+
+
+def _bases(baked: BlendSkinned | Static, rows: Int[np.ndarray, " k"]) -> Any:
+    return _rows(baked.bases, rows, second=("means", "log_scales", "opacity_logits", "sh"))
+
+
+def _network(baked: BlendSkinned | Static, rows: Int[np.ndarray, " k"]) -> Any:
+    network = _rows(baked.network, rows, "base")
+    return network if network is None else replace(network, along=_rows(network.along, rows, "basis"))
+
+
+def _rows(record: Any, rows: Int[np.ndarray, " k"], *first: str, second: tuple[str, ...] = ()) -> Any:
+    """A record, or None, with some rows of its arrays along their first or second axis. None stays None."""
+    if record is None:
+        return None
+    axes = dict.fromkeys(first, 0) | dict.fromkeys(second, 1)
+    found = {name: getattr(record, name) for name in axes}
+    kept = {name: np.take(array, rows, axes[name]) for name, array in found.items() if array is not None}
+    return replace(record, **kept)

@@ -1,18 +1,42 @@
-"""What the writers of Gaussians share: checked arrays and unit rotations."""
+"""What the files of Gaussians in a pose share: options, checked arrays and unit rotations. Torch is needed to read."""
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from mien.errors import UserError
-from mien.gaussians import Gaussians
+from mien.formats.format import Content, PoseOptions
 
+if TYPE_CHECKING:
+    import mien.gaussians
+
+MAX_GAUSSIANS = 2_000_000
+"""Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
 
 
-def finite_arrays(path: Path, gaussians: Gaussians) -> tuple[np.ndarray, ...]:
-    """Means, quaternions, scales, opacities and SH of unbatched Gaussians as float32."""
+@dataclass(frozen=True)
+class SplatOptions(PoseOptions):
+    """Options of files whose usual viewers take +y for down."""
+
+    y_down: bool = False
+    """Turn the head by half a turn about x, for viewers that take +y for down and would show it upside down."""
+
+    def pose(self, content: Content) -> "mien.gaussians.Gaussians":
+        """Return the Gaussians as they are written."""
+        from mien.formats.shared.world_space import with_y_down
+
+        return with_y_down(content.pose()) if self.y_down else content.pose()
+
+
+def finite_arrays(path: Path, gaussians: "mien.gaussians.Gaussians") -> tuple[np.ndarray, ...]:
+    """Means, quaternions, scales, opacities and SH of unbatched Gaussians in world space as float32."""
+    assert not gaussians.batched, "write one timestep: gaussians.timestep(t)"
+    assert gaussians.T_world_local is None, "move the Gaussians to world space: in_world(gaussians)"
     arrays = tuple(getattr(gaussians, name).detach().cpu().float().numpy() for name in _NAMES)
     bad = np.zeros(len(gaussians), bool)
     for array in arrays:
@@ -20,6 +44,15 @@ def finite_arrays(path: Path, gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     if bad.any():
         raise UserError(f"{path}: {bad.sum()} of {len(bad)} Gaussians are NaN or infinite; train it again")
     return arrays
+
+
+def gaussians_of(arrays: Iterable[np.ndarray]) -> "mien.gaussians.Gaussians":
+    """Gaussians of means, quaternions, scales, opacities and SH."""
+    import torch
+
+    from mien.gaussians import Gaussians
+
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:

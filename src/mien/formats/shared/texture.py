@@ -22,8 +22,6 @@ VIEWS = tuple((yaw, 0) for yaw in range(0, 360, 30)) + tuple(
 """Sides that the head is drawn from: degrees to the person's left, and upwards."""
 FRONT_VIEWS = ((0, 0), (0, 25), (0, -25), (-30, 0), (30, 0))
 """Sides from which an open mouth and turned eyes show what is hidden at rest."""
-_FIELD, _DISTANCE, _SIZE = 0.4, 1.0, 1024
-"""Field of view in radians, distance in metres and side in pixels of these pictures."""
 _DEPTH_TOLERANCE = 0.0005
 """Depth in metres behind the mesh's nearest surface up to which a texel counts as visible, beside the depth that one
 pixel of an inclined surface has. Lids are thin."""
@@ -35,9 +33,6 @@ _BEHIND = 0.025
 what is behind a thin surface, such as the mouth through the nape."""
 _LITTLE = 1e-5
 """Weight of the colour of the nearest Gaussians, which decides where no picture shows the surface."""
-_NEAREST, _CHUNK = 8, 512
-_ROUNDS = 8
-"""Texels by which the texture is continued over the borders of its pieces, so that they do not show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +64,8 @@ def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[
     """A texture [size, size], 0..1, with its first row at v = 1: the colours of the Gaussians as one sees them outside.
 
     Each texel is the mean over the views that see it, weighted by how squarely they do. A view that sees through a thin
-    surface, such as the faded nape, sees what is behind it, and does not count. Surfaces that no view sees
-    have the mean colour of the Gaussians nearest to their triangle in the first pose.
-
-    Args:
-        surface: The mesh.
-        shots: The poses in which it is drawn.
-        size: Side of the texture in texels.
+    surface, such as the faded nape, sees what is behind it, and does not count. Surfaces that no view sees have the
+    mean colour of the Gaussians nearest to their triangle in the first pose.
     """
     upwards = surface.uv * torch.tensor([1.0, -1.0]) + torch.tensor([0.0, 1.0])
     K = torch.tensor([[float(size), 0, 0], [0, float(size), 0], [0, 0, 1]])
@@ -99,8 +89,8 @@ def bake_texture(surface: Surface, shots: Sequence[Shot], size: int) -> Float32[
 def _cameras(shot: Shot) -> list[Camera]:
     center = (shot.vertices.amin(0) + shot.vertices.amax(0)) / 2
     viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    viewmat[:3, 3] = -viewmat[:3, :3] @ (center + torch.tensor([0.0, 0.0, _DISTANCE]))
-    front = camera_from_fov(_FIELD, _SIZE, _SIZE, viewmat)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ (center + torch.tensor([0.0, 0.0, 1.0]))
+    front = camera_from_fov(0.4, 1024, 1024, viewmat)
     return [turned_camera(front, center, math.radians(yaw), math.radians(pitch)) for yaw, pitch in shot.views]
 
 
@@ -149,16 +139,16 @@ def _nearest_colors(surface: Surface, shot: Shot) -> Float[Tensor, "f 3"]:
     means, opacities = torch.from_numpy(gaussians.means), torch.from_numpy(gaussians.opacities)
     colors = (0.5 + SH_C0 * torch.from_numpy(gaussians.sh[:, 0])).clamp(0, 1)
     found = []
-    for part in middles.split(_CHUNK):
-        near = torch.cdist(part, means).topk(min(_NEAREST, len(means)), largest=False).indices
+    for part in middles.split(512):
+        near = torch.cdist(part, means).topk(min(8, len(means)), largest=False).indices
         weight = opacities[near].clamp_min(1e-6)[..., None]
         found.append((weight * colors[near]).sum(1) / weight.sum(1))
     return torch.cat(found)
 
 
 def _continued(texture: Float[Tensor, "s s 3"], covered: Tensor) -> Float[Tensor, "s s 3"]:
-    """The texture with the colours at the borders of its pieces continued outwards."""
-    for _ in range(_ROUNDS):
+    """The texture with the colours at the borders of its pieces continued outwards, so that these do not show."""
+    for _ in range(8):
         weight = covered[None, None].float()
         both = torch.cat([texture.permute(2, 0, 1)[None] * weight, weight], 1)
         around = torch.nn.functional.avg_pool2d(both, 3, stride=1, padding=1)

@@ -13,8 +13,7 @@ from jaxtyping import Float32
 
 from mien import _native
 from mien.errors import UserError
-from mien.formats.shared.packed import Motion, pack
-from mien.formats.shared.rows import with_rows
+from mien.formats.shared.packed import Motion, pack, with_rows
 from mien.runtime.avatar import Avatar
 from mien.runtime.baked import Camera, PortableAvatar
 from mien.runtime.named import GAZE_NAMES, is_gaze, presets_for
@@ -32,15 +31,7 @@ _STEPS = 64
 def fitted(
     path: Path, avatar: PortableAvatar, motion: Motion | None, largest: int, size: Callable[[bytes], int]
 ) -> PortableAvatar:
-    """The avatar with as many Gaussians as a file can hold.
-
-    Args:
-        path: The file, for messages.
-        avatar: The avatar.
-        motion: The motion that is packed with it, if there is one.
-        largest: Largest size of the file in bytes.
-        size: Returns the size of the file for a packed avatar.
-    """
+    """The avatar with as many Gaussians as a file of `largest` bytes can hold, which has `size(packed)` bytes."""
 
     def bytes_of(some: PortableAvatar) -> int:
         return size(pack(some, motion))

@@ -10,10 +10,10 @@ import base64
 import gzip
 import hashlib
 import html
+import io
 import lzma
 import os
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 
 from mien.disk.reading import read_bytes
@@ -48,34 +48,17 @@ _SHRUNK = ".xz"
 """Further ending of files that lie compressed in mien's own folder, so that mien is quickly downloaded."""
 
 
-@dataclass(frozen=True)
-class WebcamFiles:
-    """Where the landmarker's files are."""
-
-    package: Path
-    """Folder of the npm package."""
-    model: Path | None = None
-    """The file face_landmarker.task. None for that of mien."""
+def webcam_files(model: Path | None = None) -> dict[str, bytes]:
+    """Return the contents of the landmarker's files: its code, and the given model, a variable's, or else mien's."""
+    named = os.environ.get(MODEL_VARIABLE)
+    return {**_package(), "model": _model(model or (Path(named) if named else None))}
 
 
-def find_webcam_files(model: Path | None = None) -> WebcamFiles:
-    """Return the landmarker's files on this machine.
-
-    The package is in the folder that MIEN_TASKS_VISION names, or else in that of mien.
-
-    Args:
-        model: The model's file. None for the one that MIEN_FACE_LANDMARKER names, or else for that of mien.
-    """
-    return WebcamFiles(_package(), _model(model))
-
-
-def webcam_part(files: WebcamFiles) -> str:
+def webcam_part(model: Path | None = None) -> str:
     """Return what a page holds for the webcam, as html."""
-    contents = {name: _read(_place(files.package, path)) for name, (path, _) in _FILES.items()}
-    contents["model"] = own_model() if files.model is None else _read(files.model)
     parts = "\n".join(
         f'<script type="application/octet-stream" id="webcam-{name}">{_packed(content)}</script>'
-        for name, content in contents.items()
+        for name, content in webcam_files(model).items()
     )
     page = TEMPLATE.read_text(encoding="utf-8").replace("{{notices}}", html.escape(NOTICES.read_text(encoding="utf-8")))
     return page.replace("{{parts}}", parts)
@@ -83,14 +66,7 @@ def webcam_part(files: WebcamFiles) -> str:
 
 def own_model() -> bytes:
     """Return the bytes of the face_landmarker.task that comes with mien."""
-    return b"".join(_read(OWN / part) for part in _MODEL_PARTS)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return _content(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    return b"".join(_content(OWN / part) for part in _MODEL_PARTS)
 
 
 def _packed(content: bytes) -> str:
@@ -98,12 +74,7 @@ def _packed(content: bytes) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file, which may lie compressed.
-
-    Raises:
-        ValueError: the file is too large or damaged.
-        OSError: the file is missing or cannot be read.
-    """
+    """The bytes of a file, which may lie compressed. A file that is too large or damaged is a ValueError."""
     content = read_bytes(path, _MOST_BYTES)
     if _SHRUNK not in path.suffixes:
         return content
@@ -113,36 +84,32 @@ def _content(path: Path) -> bytes:
         raise ValueError(str(error)) from None
 
 
-def _place(folder: Path, name: str) -> Path:
-    """A file of the package, in whose own folder some lie in `wasm`. In mien's folder, some lie compressed."""
-    places = (folder / name, folder / "wasm" / name, folder / f"{name}{_SHRUNK}")
-    return next((path for path in places if path.is_file()), folder / name)
-
-
-def _package() -> Path:
+def _package() -> dict[str, bytes]:
+    """The contents of the package's files."""
     named = os.environ.get(PACKAGE_VARIABLE)
-    folder = Path(named) if named else OWN
+    folder, contents = Path(named) if named else OWN, {}
     remedy = (
         f"run `make landmarker` in mien's checkout, or unpack the result of `npm pack {PACKAGE}@{VERSION}` and set "
         f"{PACKAGE_VARIABLE} to its folder"
     )
-    for name, expected in _FILES.values():
-        path = _place(folder, name)
+    for part, (name, expected) in _FILES.items():
+        # Some of the package's files lie in its folder `wasm`, and some of mien's lie compressed.
+        places = (folder / name, folder / "wasm" / name, folder / f"{name}{_SHRUNK}")
+        path = next((path for path in places if path.is_file()), folder / name)
         try:
-            content = _content(path)
+            contents[part] = _content(path)
         except (OSError, ValueError):
             raise UserError(f"{folder}: --webcam needs {name} of the npm package {PACKAGE}; {remedy}") from None
-        if hashlib.sha256(content).hexdigest() != expected:
+        if hashlib.sha256(contents[part]).hexdigest() != expected:
             raise UserError(f"{path}: is not that of version {VERSION} of {PACKAGE}, which pages need; {remedy}")
-    return folder
+    return contents
 
 
-def _model(given: Path | None) -> Path | None:
-    named = os.environ.get(MODEL_VARIABLE)
-    path = given or (Path(named) if named else None)
+def _model(path: Path | None) -> bytes:
+    """The content of a model's file, or of mien's own model."""
     own = all((OWN / part).is_file() for part in _MODEL_PARTS)
     if path is None and own:
-        return None
+        return own_model()
     if path is None:
         raise UserError(
             "--webcam needs MediaPipe's network for blend shapes, which mien's source distribution leaves out: install "
@@ -152,12 +119,10 @@ def _model(given: Path | None) -> Path | None:
     if not path.is_file():
         raise UserError(f"{path}: no such file; {remedy}")
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError
-        with zipfile.ZipFile(path) as archive:
-            sound = set(archive.namelist()) >= _MEMBERS
+        content = _content(path)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if set(archive.namelist()) >= _MEMBERS:
+                return content
     except (OSError, ValueError, zipfile.BadZipFile):
-        sound = False
-    if not sound:
-        raise UserError(f"{path}: is no face_landmarker.task with blend shapes; {remedy}")
-    return path
+        pass
+    raise UserError(f"{path}: is no face_landmarker.task with blend shapes; {remedy}")

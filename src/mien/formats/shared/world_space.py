@@ -1,4 +1,4 @@
-"""Moves Gaussians from their local frame to world space, for programs that have no local frame."""
+"""Moves Gaussians into frames of other programs: to world space, and to +y down."""
 
 import math
 
@@ -23,6 +23,21 @@ def in_world(gaussians: Gaussians) -> Gaussians:
     quats = multiply_quaternions(turn.expand_as(gaussians.quats), gaussians.quats)
     sh = rotate_sh(gaussians.sh, pose[:3, :3])
     return Gaussians(world_means(gaussians), quats, gaussians.scales, gaussians.opacities, sh)
+
+
+def with_y_down(gaussians: Gaussians) -> Gaussians:
+    """Unbatched Gaussians in world space after half a turn about x, which changes signs alone, so it is exact."""
+    turned = gaussians.means.new_tensor([1, -1, -1])
+    w, x, y, z = gaussians.quats.unbind(-1)
+    directions, count = _spread_directions()[1:2].to(gaussians.sh), gaussians.sh.shape[-2]
+    signs = spherical_harmonics_basis(directions * turned, count) / spherical_harmonics_basis(directions, count)
+    return Gaussians(
+        gaussians.means * turned,
+        torch.stack([-x, w, -z, y], dim=-1),
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh * signs.sign().T,
+    )
 
 
 def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:

@@ -197,7 +197,7 @@ def _benchmark(given: Recordings) -> HeldOut | None:
         raise UserError(
             f"{words}: there is no test sequence (FREE, EMO-1, SEN-09, SEN-10) and no camera "
             f"{', '.join(HIDDEN_CAMERAS)} to hold out, because the benchmark publishes none; train with --split "
-            "none, and write the submission with `mien export --format nersemble-benchmark`"
+            "none, and write the submission with `mien export-dataset --format nersemble-benchmark`"
         )
     return HeldOut(tests, cameras)
 
