@@ -11,7 +11,7 @@ from mien.commands.parsing.options import check_avatar, check_port, check_viewer
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
-from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.driver import name_driver, name_neutral
 from mien.pipeline.picture_options import PictureOptions
 
 
@@ -69,8 +69,8 @@ class Command:
         else:
             # The number of frames is known only after tracking, but a video or numbered pictures take any number.
             self.picture.plan(self.out, 2)
-        check_driver(Path(self.by), self.sequence, self.fps, self.capture)
-        check_neutral(self.neutral)
+        name_driver(Path(self.by), self.sequence, self.fps, self.capture)
+        name_neutral(self.neutral)
 
     def _check_viewer(self) -> None:
         """Check that the viewer can show it, which has no options of pictures."""
@@ -120,7 +120,7 @@ class Command:
         run_viewing_stage(self.workspace, self.run_name, motions, Place("127.0.0.1", self.port))
 
     def _follow(self) -> None:
-        from mien.driving.live.follower import FollowOptions
+        from mien.driving.follower import FollowOptions
         from mien.pipeline.follow import CameraOptions, run_following_stage
         from mien.pipeline.view import Place
 

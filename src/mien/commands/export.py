@@ -15,7 +15,7 @@ from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, Holds
 from mien.formats.registry import endings, find_format, format_of, formats, numbered
-from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.driver import name_driver, name_neutral
 
 if TYPE_CHECKING:
     from mien.formats.format import Options
@@ -177,14 +177,14 @@ class Command:
             raise UserError(f"--every {self.every}: {remedy}")
         if self.neutral is not None and self.series is None:
             raise UserError(f"--neutral {self.neutral}: is for motions; give it together with --series")
-        check_neutral(self.neutral)
+        name_neutral(self.neutral)
         if self.series is not None and self.series not in (names := workspace.sequence_names()):
             if not Path(self.series).exists():
                 raise UserError(
                     f"--series {self.series}: no such sequence, file or folder; {self.workspace} has the sequences "
                     f"{', '.join(names) or '(none)'}; or give a workspace, a video, a recording or a sound file"
                 )
-            check_driver(Path(self.series), None)
+            name_driver(Path(self.series), None)
         check_writable(self._first_path(kind), folder=kind.holds == "folder")
 
     def run(self) -> None:

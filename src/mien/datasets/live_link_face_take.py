@@ -67,7 +67,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
             files[DRIVER] = read_bytes(table, _MAX_CSV_BYTES)
         except (OSError, ValueError) as error:
             raise UserError(f"{table}: cannot be read ({' '.join(str(error).split())[:200]}); {REMEDY}") from None
-        from mien.driving.sources.live_link_face import read_live_link_face
+        from mien.driving.live_link_face import read_live_link_face
 
         read_live_link_face(table)  # a damaged one is refused before the video is processed
     yield Footage(path.resolve().name, (video,), files=files)

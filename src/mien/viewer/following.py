@@ -13,7 +13,7 @@ from mien.viewer.session import Seen, Session
 
 if TYPE_CHECKING:
     import mien.capture.person.faces
-    import mien.driving.live.follower
+    import mien.driving.follower
     import mien.media.live_camera
 
 STAGES = ("camera", "tracking", "drawing")
@@ -34,7 +34,7 @@ class CameraSwitch:
         self,
         session: Session,
         open_camera: Callable[[], "mien.media.live_camera.LiveCamera"],
-        make: Callable[[], "mien.driving.live.follower.Follower"],
+        make: Callable[[], "mien.driving.follower.Follower"],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Prepare to follow; nothing is opened before `start`.
@@ -50,7 +50,7 @@ class CameraSwitch:
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._camera: mien.media.live_camera.LiveCamera | None = None
-        self._follower: mien.driving.live.follower.Follower | None = None
+        self._follower: mien.driving.follower.Follower | None = None
         self.meters = Meters(STAGES)
         self.watch: Callable[[Seen], None] | None = None
         """Is called after each frame that was followed."""
@@ -111,9 +111,7 @@ class CameraSwitch:
             return ["The camera is away. mien waits for it."]
         return [_WORDS[follower.state], *self.meters.words(self._clock())]
 
-    def _run(
-        self, camera: "mien.media.live_camera.LiveCamera", follower: "mien.driving.live.follower.Follower"
-    ) -> None:
+    def _run(self, camera: "mien.media.live_camera.LiveCamera", follower: "mien.driving.follower.Follower") -> None:
         from mien.capture.person.faces import LandmarkDetector
 
         try:
@@ -128,7 +126,7 @@ class CameraSwitch:
     def _follow(
         self,
         camera: "mien.media.live_camera.LiveCamera",
-        follower: "mien.driving.live.follower.Follower",
+        follower: "mien.driving.follower.Follower",
         detector: "mien.capture.person.faces.LandmarkDetector",
     ) -> None:
         number, frames, last = -1, 0, None
@@ -150,7 +148,7 @@ class CameraSwitch:
 
     def _show(
         self,
-        follower: "mien.driving.live.follower.Follower",
+        follower: "mien.driving.follower.Follower",
         landmarks: Float[np.ndarray, "l 2"] | None,
         frame: "mien.media.live_camera.LiveFrame",
         seconds: float,
