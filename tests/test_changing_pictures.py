@@ -16,7 +16,7 @@ from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
 from mien.capture.settings import CaptureSettings
 from mien.errors import UserError
-from mien.media.fields import Deinterlace, FieldOrder, deinterlace
+from mien.media.fields import Deinterlace
 from mien.media.source import FrameSelection, open_source
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames, write_video
 
@@ -341,17 +341,6 @@ def test_only_the_interlaced_frames_change_and_unmarked_ones_if_the_user_says_so
         assert (one.is_deinterlaced, other.is_deinterlaced) == (False, True)
         assert one.combs() > 0.1
         assert bend_ratio(green(other)) < bend_ratio(green(one)) / 4
-
-
-def test_a_clip_that_changes_its_size_passes(pattern):
-    frames = flagged(woven(pattern, "tff", 4), "yuv420p", ["tff"] * 4)
-    smaller = flagged([picture[:64, :64] for picture in woven(pattern, "tff", 4)], "yuv420p", ["tff"] * 4)
-    given, read, found = frames[:2] + smaller[:3] + frames[2:], [], []
-    for frame in deinterlace((read.append(frame) or frame for frame in given), FieldOrder("h264"), "auto"):
-        found.append(frame)
-        assert len(read) <= len(found) + 1
-    assert [frame.shown.width for frame in found] == [128, 128, 64, 64, 64, 128, 128]
-    assert [frame.stored for frame in found] == given
 
 
 def write_single_fields(path: Path, pictures: list[np.ndarray]) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from mien.capture.from_video import (
     RECIPE,
     STATE,
     CaptureJob,
+    capture_once,
     check_place,
     cleaning_up,
     open_job,
@@ -38,7 +40,6 @@ from mien.capture.settings import CaptureSettings
 from mien.capture.store import check_room, finish_capture, partial_folder, read_capture
 from mien.disk.files import file_digest
 from mien.disk.inside import remove_tree
-from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.machine.progress import say
 
@@ -91,19 +92,16 @@ def capture_cameras(
     for job, camera in zip(jobs, cameras, strict=True):
         _check_size(job, camera)
     whole = _joined(jobs, cameras, name, file_digest(calibration))
-    capture = read_finished(out, whole.key, tell=False)
-    if capture is not None:
-        return capture
-    _check_lengths(jobs, cameras)
-    with hold(out):
-        capture = read_finished(out, whole.key)
-        if capture is not None:
-            return capture
+
+    def work() -> Capture:
+        _check_lengths(jobs, cameras)
         check_place(out, whole)
         with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
             views = _survey_views(jobs, cameras, prepare(survey_folder, whole.key))
             _capture_views(views, whole, settings, out)
-    return read_capture(out)
+        return read_capture(out)
+
+    return capture_once(out, partial(read_finished, out, whole.key), work)
 
 
 def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool) -> CaptureJob:

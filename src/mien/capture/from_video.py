@@ -5,11 +5,12 @@ Only a few frames are in memory at a time.
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -37,6 +38,7 @@ RECIPE = 7
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
 STATE, _CHUNKS = "state.json", "chunks"
 _NEIGHBORS = 4  # most captures of a workspace that a new one is compared with
+_Result = TypeVar("_Result", Capture, list[Capture])
 
 
 @dataclass(frozen=True)
@@ -81,18 +83,20 @@ def capture_video(
     another source; anything else is refused. `name` is by default the source's name without its ending.
     """
     job = open_job(source, settings or CaptureSettings(), name, replace)
-    capture = read_finished(out, _part_key(job, 1, 1), tell=False)
-    if capture is not None:
-        return capture
-    with hold(out):
-        return _capture_whole(out, job)
+    return capture_once(out, partial(read_finished, out, _part_key(job, 1, 1)), partial(_capture_whole, out, job))
+
+
+def capture_once(folder: Path, read: Callable[[bool], _Result | None], work: Callable[[], _Result]) -> _Result:
+    """Return what is finished already, or else do the work under the folder's lock. `read` may tell of damage."""
+    finished = read(False)
+    if finished:
+        return finished
+    with hold(folder):
+        # Another process may have finished it before this one got the lock.
+        return read(True) or work()
 
 
 def _capture_whole(out: Path, job: CaptureJob) -> Capture:
-    # Another process may have finished it before this one got the lock.
-    capture = read_finished(out, _part_key(job, 1, 1))
-    if capture is not None:
-        return capture
     check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
     with cleaning_up(out, scratch) as survey_folder:
@@ -119,18 +123,11 @@ def capture_video_parts(
     captures are returned in the video's order; the `name` of each is the name of its folder.
     """
     job = open_job(source, settings or CaptureSettings(), name, replace)
-    finished = _read_finished_parts(sequences, job, tell=False)
-    if finished:
-        return finished
-    with hold(sequences / job.name):
-        return _capture_parts(sequences, job)
+    read, work = (partial(each, sequences, job) for each in (_read_finished_parts, _capture_parts))
+    return capture_once(sequences / job.name, read, work)
 
 
 def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
-    # Another process may have finished them before this one got the lock.
-    finished = _read_finished_parts(sequences, job)
-    if finished:
-        return finished
     for first in (job.name, f"{job.name}-1"):
         check_place(_capture_dir(sequences, first), job)
     with cleaning_up(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
@@ -198,8 +195,7 @@ def check_neighbors(
             other = read_capture(json_path.parent)
         except UserError:
             continue  # whoever uses it says what is wrong with it
-        part = other.source.get("part")
-        if folder.name == name or isinstance(part, dict) and part.get("of") == name:
+        if name in (folder.name, _part_in(other.source).get("of")):
             continue
         shapes = face_shapes(pictures, detector) if shapes is None else shapes
         difference = shape_difference(shapes, face_shapes(other.images[:, 0], detector))
@@ -253,9 +249,7 @@ def _read_finished_parts(sequences: Path, job: CaptureJob, tell: bool = True) ->
     whole = read_finished(_capture_dir(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
-    source = _read_source(_capture_dir(sequences, f"{job.name}-1")) or {}
-    part = source.get("part")
-    count = part.get("count") if isinstance(part, dict) else None
+    count = _part_in(_read_source(_capture_dir(sequences, f"{job.name}-1"))).get("count")
     if not isinstance(count, int):
         return []
     found: list[Capture] = []
@@ -310,22 +304,16 @@ def prepare(work: Path, key: str) -> Path:
     """Prepare a folder for unfinished work. Its content is kept only if it belongs to the same key."""
     try:
         kept = read_json(work / STATE, "mien.capture_state", 1).get("key") == key
+        # Links could make mien write somewhere else, and mien never makes any.
+        check_tree(work)
+        kept = kept and not work.is_symlink() and not has_other_names(work)
     except UserError:
         kept = False
-    if not kept or _leads_out(work):
+    if not kept:
         remove_tree(work)
         work.mkdir(parents=True)
         write_json(work / STATE, "mien.capture_state", 1, {"key": key})
     return work
-
-
-def _leads_out(work: Path) -> bool:
-    """Whether links in the unfinished work could make mien write somewhere else. mien never makes such links."""
-    try:
-        check_tree(work)
-        return work.is_symlink() or has_other_names(work)
-    except UserError:
-        return True
 
 
 def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Survey, GivenInputs]:
@@ -367,9 +355,7 @@ def _finish(job: CaptureJob, draft: Draft, key: str, place: tuple[int, int], giv
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:
     """Warn about sequences that an earlier capture of the same video left under other names."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
-        source = _read_source(path.parent) or {}
-        part = source.get("part")
-        is_ours = isinstance(part, dict) and part.get("of") == job.name
+        is_ours = _part_in(_read_source(path.parent)).get("of") == job.name
         if is_ours and path.parent.parent.name not in names:
             say(
                 f"warning: {path.parent.parent}: is left over from an earlier capture of {job.name}; "
@@ -384,6 +370,12 @@ def _read_source(out: Path) -> dict[str, Any] | None:
     except UserError:
         return None
     return source if isinstance(source, dict) else None
+
+
+def _part_in(source: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the entry of a capture's `source` about the video that it is a part of, if it has one."""
+    part = (source or {}).get("part")
+    return part if isinstance(part, dict) else {}
 
 
 def read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:

@@ -129,12 +129,8 @@ def with_neutral(
 ) -> Driver:
     """The driver with its face at rest as `--neutral` asks, and a line that says what was taken.
 
-    Args:
-        driver: The driver. Its `at_rest` is what its frames, or its format, say.
-        model: The avatar's face model.
-        neutral: first, calm, model, a file, or None for the default: `driver.at_rest` within `rest_of`'s limits.
-        who: What messages call the driver.
-        other: The driver of the file, if `neutral` is a file.
+    `neutral` is first, calm, model, the file of the `other` driver, or None for the default: `driver.at_rest` within
+    the limits of `rest_of`. `who` is what messages call the driver.
     """
     middle, moved = _median(driver.seen), ()
     if neutral is None:

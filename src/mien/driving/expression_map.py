@@ -78,7 +78,13 @@ def _normal_equations(source: FaceModel, target: FaceModel) -> tuple[Float[Tenso
     (rest, theirs), (our_rest, ours) = _displacements(_at_landmarks(source)), _displacements(_at_landmarks(target))
     theirs = (theirs @ _registration(rest, our_rest).T).flatten(1)
     ours = ours.flatten(1)
-    normal = ours @ ours.T / _TRANSFER_NOISE**2 + torch.diag(_precisions(target))
+    # The inverse variances of the motions, by which the fit prefers usual faces.
+    e, sigmas = len(target.expression_names), target.expression_sigmas
+    spread = torch.full((e,), _TRANSFER_SPREAD) if sigmas is None else sigmas
+    if _JAW in target.free_joint_names:
+        spread = torch.cat([spread, torch.full((3,), _TRANSFER_JAW_SPREAD)])
+    precisions = spread.double().clamp_min(1e-6).square().reciprocal()
+    normal = ours @ ours.T / _TRANSFER_NOISE**2 + torch.diag(precisions)
     return theirs @ ours.T / _TRANSFER_NOISE**2, normal
 
 
@@ -93,15 +99,6 @@ def _bounds(model: FaceModel) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]
     if _JAW in model.free_joint_names:
         bounds = torch.cat([bounds, torch.tensor(_TRANSFER_JAW, dtype=torch.float64)])
     return bounds[:, 0], bounds[:, 1]
-
-
-def _precisions(model: FaceModel) -> Float[Tensor, " t"]:
-    """Inverse variances of the motions, by which the fit prefers usual faces."""
-    e, sigmas = len(model.expression_names), model.expression_sigmas
-    spread = torch.full((e,), _TRANSFER_SPREAD) if sigmas is None else sigmas
-    if _JAW in model.free_joint_names:
-        spread = torch.cat([spread, torch.full((3,), _TRANSFER_JAW_SPREAD)])
-    return spread.double().clamp_min(1e-6).square().reciprocal()
 
 
 def _marks(model: FaceModel, face: FaceParams) -> Float[Tensor, "b l 3"]:

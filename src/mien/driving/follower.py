@@ -75,12 +75,6 @@ def _share(cutoff: Float[np.ndarray, " n"], elapsed: float) -> Float[np.ndarray,
     return 1 / (1 + 1 / (2 * math.pi * cutoff * elapsed))
 
 
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, " 3"]
-
-
 @dataclass(frozen=True)
 class FollowOptions:
     """How an avatar follows."""
@@ -116,7 +110,8 @@ class Follower:
         self._fit = LandmarkFit(model, person)
         self._lock = threading.Lock()
         self._learning: deque[tuple[float, np.ndarray]] = deque(maxlen=120)
-        self._rest: _Pose | None = None
+        self._rest: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None = None
+        """Rotation and translation of the head at rest."""
         self._seen_at: float | None = None
         self._values = np.zeros(6 + len(self._fit.names))
         self._driven_at = 0.0
@@ -168,17 +163,17 @@ class Follower:
         away = axis_angle_from_matrix(rotation[None])
         share = float(kept_share(torch.tensor(np.linalg.norm(away)), REST_HEAD))
         rotation = rotation if share == 1 or self._asked else matrix_from_axis_angle(share * away)[0]
-        self._rest = _Pose(rotation, np.median([pose.translation for pose in poses], axis=0))
+        self._rest = rotation, np.median([pose.translation for pose in poses], axis=0)
         self._learning.clear()
         self._smoothing = self._new_smoothing()
         self._smoothing(self._values, self._driven_at)
 
     def _follow(self, fitted: Fitted, seconds: float) -> None:
         self.state, self.error = "following", fitted.error
-        rest = self._rest
-        assert rest is not None
-        turn = axis_angle_from_matrix((rest.rotation.T @ fitted.rotation)[None])[0]
-        moved = rest.rotation.T @ (fitted.translation - rest.translation)
+        assert self._rest is not None
+        rotation, translation = self._rest
+        turn = axis_angle_from_matrix((rotation.T @ fitted.rotation)[None])[0]
+        moved = rotation.T @ (fitted.translation - translation)
         self._values = self._smoothing(np.concatenate([turn, moved, fitted.coefficients]), seconds)
 
     def _without_face(self, seconds: float) -> None:

@@ -197,8 +197,12 @@ def _seconds(
     if key == _TIMECODE_NAME:
         whole, frames = _timecodes(path, cells)
         if fps is None or frames.astype(int).min() < frames.astype(int).max():
-            seconds, frame = _of_timecodes(path, whole, frames, fps)
-            return seconds, Times(**own, slack=frame, remedy="; delete the line, or set --fps", faster=faster), ()
+            if fps is not None and fps <= int(frames.max()):
+                last = int(frames.max())
+                raise UserError(f"{path}: --fps {fps:g}: its frame numbers go up to {last}; give more than that")
+            usual = next((rate for rate in _RATES if rate > frames.max()), 1000) if whole.max() > whole.min() else 60
+            rate, remedy = fps or usual, "; delete the line, or set --fps"
+            return whole + frames / rate, Times(**own, slack=1 / rate, remedy=remedy, faster=faster), ()
     elif key == _FRAME:
         numbers = _clock(path, name, cells)
         line = f"{path}: has frame numbers and no times, so {_ASSUMED_RATE:g} rows a second are assumed; --fps sets it"
@@ -221,7 +225,7 @@ def _clock(path: Path, name: str, cells: list[tuple[int, str]]) -> np.ndarray:
 
 
 def _timecodes(path: Path, cells: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
-    """Whole seconds and frame numbers of timecodes."""
+    """Whole seconds of timecodes, which go on after midnight, and frame numbers."""
     parsed = []
     for line, text in cells:
         match = _TIMECODE.fullmatch(with_point(text.strip()))
@@ -233,19 +237,7 @@ def _timecodes(path: Path, cells: list[tuple[int, str]]) -> tuple[np.ndarray, np
         hours, minutes, seconds, frame = (int(part) for part in match.groups()[:4])
         parsed.append((3600 * hours + 60 * minutes + seconds, frame + float(f"0.{match.group(5) or 0}")))
     whole, frames = np.array(parsed).T
-    return whole, frames
-
-
-def _of_timecodes(path: Path, whole: np.ndarray, frames: np.ndarray, fps: float | None) -> tuple[np.ndarray, float]:
-    """Times in seconds, which go on after midnight, and the duration of a frame."""
-    midnights = np.diff(whole, prepend=whole[0]) < -_DAY / 2
-    whole = whole + _DAY * np.cumsum(midnights)
-    if fps is None:
-        spans_seconds = whole.max() > whole.min()
-        fps = next((rate for rate in _RATES if rate > frames.max()), 1000) if spans_seconds else 60
-    elif fps <= int(frames.max()):
-        raise UserError(f"{path}: --fps {fps:g}: its frame numbers go up to {int(frames.max())}; give more than that")
-    return whole + frames / fps, 1 / fps
+    return whole + _DAY * np.cumsum(np.diff(whole, prepend=whole[0]) < -_DAY / 2), frames
 
 
 def _turned(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:

@@ -37,13 +37,8 @@ def drive(
     head rotation and translation transfer the driver's motion relative to the driver's neutral frame to the avatar's
     neutral frame. A nod therefore stays a nod even if the two people were filmed from different sides.
 
-    Args:
-        driver: The timesteps to play.
-        driver_neutral: One timestep of the driver at rest, see `neutral_of`.
-        avatar_neutral: One timestep of the avatar's person at rest.
-        expression_bounds: `FaceModel.expression_bounds`.
-        with_head_pose: Whether the head follows the driver's. If not, it stays at the avatar's neutral.
-        who: What messages call the driver, such as its file.
+    Each neutral is one timestep (see `neutral_of`), and the bounds are `FaceModel.expression_bounds`. Without the head
+    pose, the head stays at the avatar's neutral. `who` is what messages call the driver, such as its file.
     """
     for name in ("expression", "joints"):
         theirs, ours = getattr(driver, name).shape[1:], getattr(avatar_neutral, name).shape[1:]

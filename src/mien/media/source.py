@@ -20,7 +20,7 @@ from mien.media.decoding import check_file_size, decode_picture, may_have_alpha
 from mien.media.display import as_matte, over_ground
 from mien.media.fields import Deinterlace
 from mien.media.lens import Lens
-from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily
+from mien.media.video import LazyFrame, VideoInfo, count_frames, probe_video, read_lazily
 from mien.media.video_file import VIDEO_SUFFIXES
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
@@ -51,25 +51,21 @@ class FrameSource:
     fps: float
     """Frame rate of the frames taken, so after `stride`."""
     expected_frames: int
-    """Expected number of frames, for progress bars. Only reading the source gives the true number."""
+    """For progress bars. Only reading the source gives the true number."""
     content_hash: str
     """Hash of the file, or of the names and contents of all images."""
-    hdr: str = ""
-    """HDR transfer function: PQ, HLG, or empty for ordinary pictures."""
+    video: VideoInfo
+    """What a video states about itself, which is nothing for a folder."""
     quarter_turns: int = 0
     """Number of quarter turns clockwise, besides the file's own rotation flag."""
     deinterlace: Deinterlace = "auto"
     """Which frames of a video are deinterlaced."""
     stream: int | None = None
     """Index of the video's stream that is read. None for a folder."""
-    other_streams: tuple[int, ...] = ()
-    """Indices of the video's other streams of pictures."""
-    has_field_pictures: bool = False
-    """Whether the pictures are single fields of interlaced video, of half the height (HEVC)."""
     lens: Lens | None = None
-    """Lens whose distortion is taken out of the turned pictures. None for pictures as they are."""
+    """Lens whose distortion is taken out of the turned pictures."""
     colors: ColorCorrection | None = None
-    """Correction of the pictures' colours. None for colours as filmed."""
+    """Correction of the pictures' colours."""
 
     def frames(self, longest_side: int = 0) -> Iterator[LazyFrame]:
         """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0."""
@@ -133,36 +129,22 @@ def open_source(
 
     `fps` is for a folder: a video has its own. `stream` is by default that of `mien.media.video_file.find_streams`.
     """
-    info = None
     if path.is_dir():
         images = list_images(path)
-        total = len(images)
         for image in images:
             check_file_size(image)
-        content_hash = _hash_files(images, with_names=True)
+        info, content_hash = VideoInfo(fps, len(images)), _hash_files(images, with_names=True)
     else:
-        info = probe_video(path, stream)
-        fps, total = info.fps, info.frames
-        content_hash = _hash_files([path], with_names=False)
+        info, content_hash = probe_video(path, stream), _hash_files([path], with_names=False)
+    fps, total = info.fps, info.frames
     last = min(total, round(selection.end * fps)) if selection.end else total
     last = min(last, max(0, total - selection.offset))
     remaining = max(0, last - round(selection.start * fps))
     expected = -(-remaining // selection.stride)
     if selection.max_frames:
         expected = min(expected, selection.max_frames) if total else selection.max_frames
-    return FrameSource(
-        path,
-        selection,
-        fps / selection.stride,
-        expected,
-        content_hash,
-        info.hdr if info else "",
-        quarter_turns,
-        deinterlace,
-        info.stream if info else None,
-        info.other_streams if info else (),
-        info is not None and info.has_field_pictures,
-    )
+    fps /= selection.stride
+    return FrameSource(path, selection, fps, expected, content_hash, info, quarter_turns, deinterlace, info.stream)
 
 
 def _turned(picture: Callable[[], np.ndarray | None], quarter_turns: int) -> Any:

@@ -49,13 +49,13 @@ class VideoInfo:
     """Average frames per second."""
     frames: int
     """Expected number of frames; 0 if the file does not state it."""
-    hdr: str
+    hdr: str = ""
     """HDR transfer function: PQ, HLG, or empty for ordinary video."""
-    has_field_pictures: bool
+    has_field_pictures: bool = False
     """Whether its pictures are single fields of interlaced video, of half the height (HEVC)."""
-    stream: int
+    stream: int | None = None
     """Index of the stream that is read."""
-    other_streams: tuple[int, ...]
+    other_streams: tuple[int, ...] = ()
     """Indices of the file's other streams of pictures."""
 
 

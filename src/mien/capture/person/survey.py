@@ -207,7 +207,7 @@ def no_face(path: Path, frames: int, remedy: str = "give a video that shows a fa
 
 def _stream_with_face(frames: FrameSource, detector: DetectorChoice) -> int | None:
     """Return the first of the file's other streams that shows a face in some pictures at its beginning."""
-    for stream in frames.other_streams:
+    for stream in frames.video.other_streams:
         other, stride = replace(frames, stream=stream), _BEGINNING // _MAX_TURNED
         pictures = itertools.islice(other.frames(_SURVEY_SIDE), 0, _BEGINNING, stride)
         with FaceFinder(detector) as finder, contextlib.suppress(UserError):
@@ -238,15 +238,15 @@ progressive clips have at most 0.0008, with noise of 8 levels 0.0027. Woven from
 
 def tell_kind(frames: FrameSource) -> None:
     """Say what the file states, before it is read."""
-    if frames.other_streams:
-        others = ", ".join(map(str, frames.other_streams))
+    if frames.video.other_streams:
+        others = ", ".join(map(str, frames.video.other_streams))
         say(
             f"{frames.path}: has several streams of pictures; stream {frames.stream} is captured, and --capture.stream "
             f"chooses another ({others})"
         )
-    if frames.hdr:
-        say(f"{frames.path}: HDR video ({frames.hdr}); its pictures are tone-mapped to sRGB")
-    if frames.has_field_pictures:
+    if frames.video.hdr:
+        say(f"{frames.path}: HDR video ({frames.video.hdr}); its pictures are tone-mapped to sRGB")
+    if frames.video.has_field_pictures:
         say(
             f"warning: {frames.path}: each picture is a single field of interlaced video, of half the height (HEVC); "
             "mien does not join them: deinterlace it with a video program and give the result"
@@ -271,7 +271,7 @@ def tell_fields(frames: FrameSource, survey: Survey) -> None:
 def kind_report(frames: FrameSource, survey: Survey) -> dict[str, Any]:
     """Return the entries for the capture's report."""
     return {
-        "hdr": frames.hdr or None,
+        "hdr": frames.video.hdr or None,
         "frames_deinterlaced": int(survey.deinterlaced.sum()),
         "combs": _has_combs(survey),
     }
