@@ -20,8 +20,8 @@ from scipy.signal import resample_poly
 
 import mien.runtime
 from mien.driving.motion import ARKIT_NAMES
-from mien.driving.sources.speech import motion_of_sound
-from mien.media.sound import RATE
+from mien.driving.speech import motion_of_sound
+from mien.media.video import RATE
 
 SENTENCES = {
     "chosen": (

@@ -12,7 +12,7 @@ import pytest
 
 from color_charts import to_light
 from mien.capture.capture import Capture
-from mien.media.tone import PQ, hlg_scene_light, pq_light
+from mien.media.colors import PQ, hlg_scene_light, pq_light
 from mien.media.video import write_video
 
 BT2020, BT709 = (0.2627, 0.0593), (0.2126, 0.0722)

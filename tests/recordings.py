@@ -4,8 +4,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from mien.driving.live_link_face import EYES, HEAD
 from mien.driving.motion import ARKIT_NAMES
-from mien.driving.sources.live_link_face import EYES, HEAD
 
 Frames = list[dict[str, float]]
 COLUMNS = ["Timecode", "BlendshapeCount", *(name[0].upper() + name[1:] for name in ARKIT_NAMES), *HEAD, *EYES]

@@ -13,10 +13,18 @@ from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.capture.cameras.calibration import CalibratedCamera
-from mien.capture.cameras.calibration_check import advise_on, warn_of_misfit
 from mien.capture.cameras.head_path import consensus, find_head_path
-from mien.capture.cameras.reading_fit import Ranked, advice_of, is_wrong, rank_readings, ties_of
-from mien.capture.cameras.readings import Reading, readings_of
+from mien.capture.cameras.readings import (
+    Ranked,
+    Reading,
+    advice_of,
+    advise_on,
+    is_wrong,
+    rank_readings,
+    readings_of,
+    ties_of,
+    warn_of_misfit,
+)
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.rotation import (

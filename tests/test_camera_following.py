@@ -14,9 +14,8 @@ from known import known
 from mien import runtime
 from mien.capture.person.faces import LandmarkDetector
 from mien.cli import main
-from mien.driving.live.follower import Follower, FollowOptions
-from mien.driving.live.landmark_fit import LandmarkFit
-from mien.driving.live.one_euro import OneEuro
+from mien.driving.follower import Follower, FollowOptions, OneEuro
+from mien.driving.landmark_fit import LandmarkFit
 from mien.errors import UserError
 from mien.face import load_face_model
 from mien.lab.synthetic import RECIPES
@@ -132,7 +131,7 @@ def test_an_avatar_learns_follows_without_lag_and_goes_to_rest(clip: Path, landm
 @pytest.fixture
 def few_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the face at rest be learnt from a few frames, which takes half a second and not several."""
-    monkeypatch.setattr("mien.driving.live.follower.LEARN_LEAST_FRAMES", 2)
+    monkeypatch.setattr("mien.driving.follower.LEARN_LEAST_FRAMES", 2)
 
 
 @pytest.mark.unchecked

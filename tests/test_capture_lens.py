@@ -19,7 +19,7 @@ from mien.capture import capture_video
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.person.crop import whole_picture
 from mien.capture.person.given import read_given
-from mien.capture.person.screen import screen_matte, screen_of, without_screen
+from mien.capture.person.plate import screen_matte, screen_of, without_screen
 from mien.capture.quality import is_light_changing, measure_face, quality_report, relative_quality
 from mien.capture.settings import CaptureSettings
 from mien.cli import main

@@ -11,9 +11,9 @@ from capture_helpers import face_picture, light_of
 from mien.capture.from_video import capture_video_parts, open_job
 from mien.capture.person import backend
 from mien.capture.person.crop import choose_crop, whole_picture
-from mien.capture.person.faces import FaceFinder, LandmarkDetector, MeshReader, second_difference_jitter
+from mien.capture.person.faces import FaceFinder, LandmarkDetector, MeshReader
 from mien.capture.person.given import read_landmarks
-from mien.capture.person.litert.mesh import Mesh
+from mien.capture.person.litert import Mesh
 from mien.capture.person.matte import Segmenter, refine_matte
 from mien.capture.person.plate import plate_matte
 from mien.capture.quality import measure_face, quality_report, relative_quality
@@ -22,8 +22,8 @@ from mien.disk.files import write_arrays
 from mien.errors import UserError
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
+from mien.media.colors import srgb_signal
 from mien.media.picture_files import write_png
-from mien.media.tone import srgb_signal
 from mien.media.video import read_lazily, read_video_frames, write_video
 from refusals import refuses
 
@@ -56,17 +56,6 @@ def test_crop_holds_the_head_of_every_frame_and_ignores_a_false_detection():
     assert choose_crop(boxed(250, 240, 300, 512, 480)[None], 512, 480, 256).height == 240
     small = choose_crop(boxed(500, 300, 60, 1280, 720)[None], 1280, 720, 512)
     assert small.width == small.crop_width == 150
-
-
-def test_jitter_is_the_second_difference():
-    times = np.arange(20.0)
-    steady = np.stack([3 * times, -times], axis=-1)[:, None]
-    assert second_difference_jitter(steady) == pytest.approx(0, abs=1e-9)
-    steady[::2, 0, 0] += 0.5
-    assert second_difference_jitter(steady) == pytest.approx(1.0)
-    steady[5] = np.nan
-    assert second_difference_jitter(steady) == pytest.approx(1.0)
-    assert np.isnan(second_difference_jitter(steady[:2]))
 
 
 def test_mattes_have_their_border_on_the_edge_of_the_picture_and_of_what_is_new():

@@ -4,7 +4,6 @@ Drawn people stand in front of plain walls, so that the true landmarks are known
 import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,12 +13,10 @@ from capture_helpers import face_picture, interrupt_at, tree_bytes
 from mien.capture import capture_video, process, read_capture
 from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
-from mien.capture.person import same_person
 from mien.capture.person.crop import Crop
 from mien.capture.person.faces import MAX_FACES, LandmarkDetector
-from mien.capture.person.matte_owner import held, without_others
-from mien.capture.person.people import choose_person
-from mien.capture.person.same_person import check_neighbors, group_people, shape_difference
+from mien.capture.person.matte import held, without_others
+from mien.capture.person.people import choose_person, group_people, shape_difference
 from mien.capture.person.survey import Survey
 from mien.capture.process import LandmarkFollower
 from mien.capture.settings import CaptureSettings
@@ -279,18 +276,6 @@ def test_people_are_told_apart_in_similar_and_in_mirrored_poses_alone() -> None:
     captures = [drawn_shapes(2, 0.4, 7), anna, drawn_shapes(2, 0.4, 8), again, drawn_shapes(3, 0.4, 9)]
     assert group_people(captures, [30, 100, 60, 20, 95]) == [[1, 3], [4], [0, 2]]
     assert group_people([drawn_shapes(2, 1.4, 5), *captures[:2]], [10, 60, 100]) == [[0, 2], [1]], "as the first person"
-
-
-def test_a_neighbor_in_another_pose_hides_no_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shapes = [drawn_shapes(2, 0.4, 6), drawn_shapes(1, 1.4, 5), drawn_shapes(1, 0.4, 1)]
-    monkeypatch.setattr(same_person, "face_shapes", lambda pictures, detector: shapes[pictures.max()])
-    new = np.zeros((1, 9, 9, 3), np.uint8)
-    for place in (tmp_path / "1" / "capture", tmp_path / "2" / "capture"):
-        place.mkdir(parents=True)
-        (place / "capture.json").touch()
-    read = lambda place: SimpleNamespace(source={}, images=new[:, None] + np.uint8(place.parent.name))  # noqa: E731
-    monkeypatch.setattr(same_person, "read_capture", read)
-    refuses(f"shows another person than {tmp_path / '2'}", check_neighbors, tmp_path, "new", Path("new"), new, "auto")
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,8 @@ import pytest
 
 from capture_helpers import BT2020, encode, hdr_signal, light_of, to_planes, write_gradient_video, write_planes
 from mien.media.camera_names import CameraName
-from mien.media.colors import Colors
+from mien.media.colors import HLG, PQ, Colors, roll_off, srgb_signal
 from mien.media.live_camera import LiveCamera
-from mien.media.tone import HLG, PQ, roll_off, srgb_signal
 from mien.media.video import count_frames, probe_video, read_video_frames, write_video
 from refusals import refuses
 

@@ -16,8 +16,7 @@ from mien.capture.from_video import capture_video_parts
 from mien.capture.parts import find_cuts
 from mien.capture.settings import CaptureSettings
 from mien.errors import UserError
-from mien.media.choices import Deinterlace
-from mien.media.fields import FieldOrder, combs, deinterlace
+from mien.media.fields import Deinterlace
 from mien.media.source import FrameSelection, open_source
 from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily, read_video_frames, write_video
 
@@ -342,33 +341,6 @@ def test_only_the_interlaced_frames_change_and_unmarked_ones_if_the_user_says_so
         assert (one.is_deinterlaced, other.is_deinterlaced) == (False, True)
         assert one.combs() > 0.1
         assert bend_ratio(green(other)) < bend_ratio(green(one)) / 4
-
-
-@pytest.mark.parametrize(("pixels", "size"), [
-    *((pixels, (3, 9)) for pixels in ("nv12", "rgb24", "gray", "gray16le", "yuvj420p", "yuv411p", "uyvy422")),
-    *((pixels, (64, 48)) for pixels in ("nv12", "p010le")),
-])  # fmt: skip
-def test_any_format_and_size_passes(pixels, size):
-    frames = flagged([np.full((size[1], size[0]), 180, np.uint8)] * 3, pixels, ["tff"] * 3)
-    for count in (1, 2, 3):
-        found = list(deinterlace(frames[:count], FieldOrder("ffv1"), "auto"))
-        assert [frame.stored.pts for frame in found] == list(range(count))
-        for frame in found:
-            assert (frame.shown.width, frame.shown.height) == size
-            shown, stored = (which.reformat(format="rgb24").to_ndarray() for which in (frame.shown, frame.stored))
-            assert np.abs(shown.astype(int) - stored).max() <= 4
-            assert combs(frame.stored) == 0
-
-
-def test_a_clip_that_changes_its_size_passes(pattern):
-    frames = flagged(woven(pattern, "tff", 4), "yuv420p", ["tff"] * 4)
-    smaller = flagged([picture[:64, :64] for picture in woven(pattern, "tff", 4)], "yuv420p", ["tff"] * 4)
-    given, read, found = frames[:2] + smaller[:3] + frames[2:], [], []
-    for frame in deinterlace((read.append(frame) or frame for frame in given), FieldOrder("h264"), "auto"):
-        found.append(frame)
-        assert len(read) <= len(found) + 1
-    assert [frame.shown.width for frame in found] == [128, 128, 64, 64, 64, 128, 128]
-    assert [frame.stored for frame in found] == given
 
 
 def write_single_fields(path: Path, pictures: list[np.ndarray]) -> None:

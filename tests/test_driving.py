@@ -12,17 +12,16 @@ from known import known
 from mien.avatar import neutral_of
 from mien.camera import camera_from_fov
 from mien.capture.capture import Capture
+from mien.capture.quality import frame_rate, pace_report
 from mien.disk.workspace import Workspace
 from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.drivers import Driver, read_tracked_driver
-from mien.driving.motion import ARKIT_NAMES, Motion, gaze_of
-from mien.driving.sources.blendshape_json import read_blendshape_json
-from mien.driving.sources.live_link_face import read_live_link_face
-from mien.driving.sources.sides import PAIRS
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.motion import ARKIT_NAMES, PAIRS, Motion, gaze_of
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import FaceParams, load_face_model
-from mien.media.pace import frame_rate, pace_report
 from mien.media.video import probe_video, write_video
 from mien.pipeline import drive as driving
 from mien.pipeline.drive import open_driver, run_driving_stage
@@ -165,7 +164,7 @@ def test_the_rate_of_a_csv_can_be_given(tmp_path: Path) -> None:
 
 PERFORMERS = [name for pair in PAIRS for name in pair]
 OBSERVERS = {"Live Link Face (.csv)": ("jawLeft", "jawRight", "mouthLeft", "mouthRight")}
-"""Coefficients whose left is the right of the face, by source: `mien.driving.sources.sides` once more, on purpose."""
+"""Coefficients whose left is the right of the face, by source: `mien.driving.sides` once more, on purpose."""
 SLIDES = ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
 
 

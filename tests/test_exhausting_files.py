@@ -31,8 +31,8 @@ from mien.cli import main
 from mien.disk.limits import rigid_fault
 from mien.disk.reading import parse_json
 from mien.driving import drive, motion
-from mien.driving.sources.blendshape_json import read_blendshape_json
-from mien.driving.sources.live_link_face import read_live_link_face
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.models.flame import read_flame

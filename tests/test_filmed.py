@@ -19,8 +19,8 @@ from mien.avatar.files import write_avatar
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.camera import Camera, camera_from_fov, look_at
 from mien.cli import main
-from mien.driving.keeping import keep_to_filmed
 from mien.driving.motion import ARKIT_NAMES
+from mien.driving.transfer import keep_to_filmed
 from mien.evaluation import living
 from mien.evaluation.living import Living
 from mien.face import FaceModel, FaceParams, load_face_model

@@ -15,9 +15,9 @@ from mien.commands.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
 from mien.disk.inside import listed
 from mien.disk.workspace import Workspace
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
 from mien.driving.motion import ARKIT_NAMES, Motion
-from mien.driving.sources.blendshape_json import read_blendshape_json
-from mien.driving.sources.live_link_face import read_live_link_face
 from mien.evaluation.image_folders import open_pictures
 from mien.media.source import list_images
 from mien.pipeline import drive as driving
@@ -48,11 +48,6 @@ def turning(*yaws: float, times: str = "0:00:00:{:02d}.0", **others: float) -> l
 ])  # fmt: skip
 def test_units_that_cannot_be_are_named(tmp_path: Path, rows: list[list[str]], words: str) -> None:
     refuses(words, read_live_link_face, write_csv(tmp_path / "a.csv", *rows))
-
-
-def test_percent_in_json_are_named(tmp_path: Path) -> None:
-    path = write_json(tmp_path / "a.json", [{"time": 0, "blendshapes": {"jawOpen": 60}}])
-    refuses("frame 0: jawOpen is 60; coefficients go from 0 to 1; divide percent by 100", read_blendshape_json, path)
 
 
 def test_fast_heads_that_are_no_degrees_are_read(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ import torch
 
 from mien.camera import camera_from_fov, look_at
 from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.drivers import read_recording
+from mien.driving.live_link_face import read_live_link_face
 from mien.driving.motion import ARKIT_NAMES, Motion, gaze_of
-from mien.driving.sources.blendshape_json import read_blendshape_json
-from mien.driving.sources.live_link_face import read_live_link_face
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face import load_face_model

@@ -26,10 +26,9 @@ from mien.capture.settings import CaptureSettings
 from mien.cli import main
 from mien.errors import UserError
 from mien.media.camera_names import CameraName
+from mien.media.colors import HLG, srgb_signal
 from mien.media.live_camera import LiveCamera
-from mien.media.sound import read_sound
-from mien.media.tone import HLG, srgb_signal
-from mien.media.video import count_frames, probe_video, read_video_frames, write_video
+from mien.media.video import count_frames, probe_video, read_sound, read_video_frames, write_video
 from mien.pipeline import drive as driving
 from test_capture_parts import streak
 from test_changing_pictures import flagged, write, write_single_fields

@@ -275,7 +275,7 @@ def test_a_camera_with_a_wrong_matrix_is_named(rig: Capture, model: FaceModel, t
 @pytest.mark.unchecked
 def test_cameras_that_misfit_together_are_warned_of(rig: Capture, model: FaceModel, tmp_path, monkeypatch) -> None:
     """No camera and no frame stands out if all have a wrong focal length."""
-    monkeypatch.setattr("mien.capture.cameras.reading_fit.INSIDE_OUT", -math.inf)  # The small model has no nose.
+    monkeypatch.setattr("mien.capture.cameras.readings.INSIDE_OUT", -math.inf)  # The small model has no nose.
     longer = torch.tensor([[1.6, 1, 1], [1, 1.6, 1], [1, 1, 1]])
     told, page = told_of(rig, model, tmp_path, lambda camera: replace(camera, K=camera.K * longer))
     assert "Warning: all cameras together see landmarks" in told

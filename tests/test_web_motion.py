@@ -11,15 +11,15 @@ import torch
 from mien import runtime
 from mien.cli import main
 from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
+from mien.driving.motion import PAIRS
 from mien.driving.rest import rest_of
-from mien.driving.sources.blendshape_json import read_blendshape_json
-from mien.driving.sources.live_link_face import read_live_link_face
-from mien.driving.sources.sides import PAIRS
-from mien.driving.sources.speech import SPEECH_BAND_WEIGHTS, SPEECH_BANDS, SPEECH_LEAST_SHARE
+from mien.driving.speech import SPEECH_BAND_WEIGHTS, SPEECH_BANDS, SPEECH_LEAST_SHARE
 from mien.driving.transfer import face_of_motion
 from mien.face import FaceParams, load_face_model
 from mien.formats.page import write_page
-from mien.media.sound import RATE
+from mien.media.video import RATE
 from recordings import COLUMNS, LAYOUTS, row, write_csv, write_json
 from test_driving_by_speech import synthesised, tone, write_wav
 from test_web_webcam import ALLOWED, FAKE

@@ -13,7 +13,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mien.driving.live.one_euro import OneEuro
+from mien.driving.follower import OneEuro
 from mien.face import FaceModel, FaceParams
 from mien.formats.page import PageOptions, write_packed, write_page
 from mien.formats.shared.webcam import VERSION

@@ -19,7 +19,7 @@ from mien.media.source import FrameSelection, FrameSource, open_source
 def read_film(root: Path, file: Path) -> FrameSource:
     """Read every stream of a film, or a folder of pictures, as a capture does."""
     source = open_source(file, FrameSelection(), 25.0)
-    for stream in (source.stream, *source.other_streams[:2]):
+    for stream in (source.stream, *source.video.other_streams[:2]):
         source = open_source(file, FrameSelection(), 25.0, stream=stream)
         for frame in itertools.islice(source.frames(48), 3 * SEEN):
             picture, alpha, (width, height) = frame.picture(), frame.alpha(), frame.size()

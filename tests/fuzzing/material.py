@@ -48,8 +48,7 @@ from mien.formats.usd import write_usd
 from mien.lab.analysis.registry import ANALYSES, AnalysisOptions, chosen_parts
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, shuffled, write_key
-from mien.media.sound import RATE
-from mien.media.video import write_video
+from mien.media.video import RATE, write_video
 from mien.runtime import write_portable
 from mien.tracking import track_subject
 from mien.tracking.fitting.resume import StageCache

@@ -16,7 +16,7 @@ from mien.capture.cameras.calibration import read_calibration
 from mien.capture.person.given import read_landmarks
 from mien.commands.batch_table import read_table
 from mien.commands.train_options import read_config_file
-from mien.driving.sources.speech import read_speech
+from mien.driving.speech import read_speech
 from mien.evaluation.image_folders import read_crops
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import read_metrics

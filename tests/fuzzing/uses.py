@@ -34,9 +34,9 @@ from mien.disk.files import read_tensors
 from mien.disk.inside import is_one_line
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving import drive
+from mien.driving.blendshape_json import read_blendshape_json
+from mien.driving.live_link_face import read_live_link_face
 from mien.driving.motion import Motion
-from mien.driving.sources.blendshape_json import read_blendshape_json
-from mien.driving.sources.live_link_face import read_live_link_face
 from mien.errors import UserError
 from mien.evaluation import evaluate
 from mien.evaluation.image_folders import open_pictures, read_picture

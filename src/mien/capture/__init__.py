@@ -6,11 +6,11 @@
 2. `person/survey.py` is the first pass: it finds all faces in every frame, and checks that they are upright.
 3. `parts` splits the video at cuts, and chooses for each part the person to follow and one crop (`person/`).
 4. `process` is the second pass: it crops each frame, finds the person's landmarks, makes the matte (`person/`),
-   measures blur and light (`quality`), and writes the pictures (`frame_files`).
-5. `outcome` writes the results of all frames beside the pictures and moves the folder to its place.
+   measures blur and light (`quality`), and writes the pictures and their decoded cache (`frame_files`).
+5. `process` then writes the results of all frames beside the pictures and moves the folder to its place (`store`).
 
-`from_cameras` runs the same steps for the videos of a rig (`cameras/`). `capture` has the class `Capture`, `store`
-writes and reads it, and `cache` has its decoded frames.
+`from_cameras` runs the same steps for the videos of a rig (`cameras/`). `capture` has the class `Capture`, and `store`
+writes and reads it.
 """
 
 import lazy_loader

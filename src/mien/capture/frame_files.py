@@ -1,22 +1,29 @@
-"""Step 4: write frames as lossless PNGs, and beside them the decoded pixels as raw files for memory maps."""
+"""Step 4: write frames as lossless PNGs, and beside them the decoded pixels as raw files for memory maps.
+
+This cache is rebuilt when the capture or one of its PNGs has changed.
+"""
 
 import hashlib
+import itertools
 import math
 import os
+import tempfile
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.disk.inside import open_new, open_to_change
-from mien.errors import UserError
-from mien.media.picture_files import decode_png, encode_picture, write_at
+from mien.disk.files import read_json, write_json
+from mien.disk.inside import drop_if_shared, open_new, open_to_change, remove_tree
+from mien.disk.locks import BeingWrittenError, hold
+from mien.errors import CannotWriteError, UserError
+from mien.machine.progress import progress_bar
+from mien.media.picture_files import decode_png, encode_picture, map_pictures, write_at
 
 FRAMES, MATTES, CACHE = "frames", "mattes", "cache"
 STAGE = "`mien capture`"
@@ -29,8 +36,6 @@ PNG_OPTIONS = (
     *((cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP) if hasattr(cv2, "IMWRITE_PNG_FILTER") else ()),
 )
 """These options take half the time of OpenCV's default for level 1 and make smaller files."""
-_MAX_QUEUED = 8
-"""Largest number of timesteps that wait to be written. It bounds the memory."""
 
 MakeFrames = Callable[[], tuple[np.ndarray, np.ndarray]]
 """Computes the images [c, h, w, 3] and mattes [c, h, w] of one timestep, for the cameras that are written."""
@@ -59,6 +64,10 @@ class FrameLayout:
         shape = (self.timesteps, len(self.camera_ids), self.height, self.width)
         return (*shape, 3) if kind == FRAMES else shape
 
+    def blank(self, kind: str) -> np.ndarray:
+        """Zeros in the shape of all frames or mattes that take no memory: stands for pictures that are on disk."""
+        return np.broadcast_to(np.uint8(0), self.shape(kind))
+
     def raw_size(self, kind: str) -> int:
         """Size of the cache file in bytes."""
         return math.prod(self.shape(kind))
@@ -68,12 +77,7 @@ class CacheWriter:
     """Fills the raw files picture by picture, with plain writes: a full disk raises an error instead of crashing."""
 
     def __init__(self, layout: FrameLayout) -> None:
-        """Open the raw files. Their content is kept.
-
-        Raises:
-            UserError: a link, a special file or a file with a second name is in the way.
-            OSError: the files cannot be written.
-        """
+        """Open the raw files. Their content is kept."""
         self._layout = layout
         (layout.folder / CACHE).mkdir(parents=True, exist_ok=True)
         self._files = {}
@@ -97,10 +101,7 @@ class CacheWriter:
 
 
 class FrameWriter:
-    """Writes frames and mattes as PNGs and into the cache, on one thread beside the caller's. Use as a context manager.
-
-    Files of an earlier, interrupted run are overwritten frame by frame.
-    """
+    """Writes frames and mattes as PNGs and into the cache, on one thread beside the caller's. A context manager."""
 
     def __init__(self, layout: FrameLayout, camera: int | None = None) -> None:
         """Prepare to write the pictures of all cameras, or of the one with this index."""
@@ -119,28 +120,18 @@ class FrameWriter:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="frame-writer")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._thread.shutdown(wait=True, cancel_futures=error is not None)
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        self._thread.shutdown(wait=True, cancel_futures=kind is not None)
         self._cache.close()
 
     def submit(self, timestep: int, make: MakeFrames) -> None:
-        """Queue one timestep, whose pictures `make` computes on the writing thread. Waits if too many are queued.
-
-        Raises:
-            OSError: an earlier timestep could not be written.
-        """
-        while len(self._pending) >= _MAX_QUEUED:
+        """Queue one timestep, whose pictures `make` computes on the writing thread. Waits if too many are queued."""
+        while len(self._pending) >= 8:  # which bounds the memory
             self._pending.popleft().result()
         self._pending.append(self._thread.submit(self._write, timestep, make))
 
     def flush(self) -> None:
-        """Wait until everything queued is written.
-
-        Raises:
-            OSError: a timestep could not be written.
-        """
+        """Wait until everything queued is written."""
         while self._pending:
             self._pending.popleft().result()
 
@@ -151,7 +142,9 @@ class FrameWriter:
             for camera, picture in zip(self._cameras, pictures, strict=True):
                 picture = np.ascontiguousarray(picture)
                 self.digests[kind][timestep, camera] = picture_digest(picture)
-                _write_png(self.layout.png(kind, timestep, camera), picture)
+                data = encode_picture(picture, options=PNG_OPTIONS)
+                with open_new(self.layout.png(kind, timestep, camera)) as file:
+                    file.write(data)
                 self._cache.write(kind, timestep, camera, picture)
 
 
@@ -168,7 +161,127 @@ def read_png(path: Path, shape: tuple[int, ...], expected_digest: int) -> UInt8[
     return picture
 
 
-def _write_png(path: Path, picture: np.ndarray) -> None:
-    data = encode_picture(picture, options=PNG_OPTIONS)
-    with open_new(path) as file:
-        file.write(data)
+_FORMAT, _VERSION = "mien.capture_cache", 1
+_ASIDE_PREFIX = ".making-"
+
+
+def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
+    """Record that the cache is complete and matches the PNGs."""
+    write_json(
+        layout.folder / CACHE / "stamp.json",
+        _FORMAT,
+        _VERSION,
+        {"capture_hash": capture_hash, "fingerprint": _fingerprint(layout)},
+    )
+
+
+def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return memory maps of all frames [t, c, h, w, 3] and mattes [t, c, h, w]. A stale cache is rebuilt first."""
+    _check_present(layout)
+    found = layout if _is_valid(layout, capture_hash) else _rebuild(layout, capture_hash, digests)
+    images, mattes = (map_pictures(found.raw(kind), found.shape(kind)) for kind in (FRAMES, MATTES))
+    if found is not layout:
+        # The maps keep the pages of a scratch folder alive. Nothing else needs its file names.
+        remove_tree(found.folder)
+    return images, mattes
+
+
+def _check_present(layout: FrameLayout) -> None:
+    expected = {f"{timestep:06d}.png" for timestep in range(layout.timesteps)}
+    for kind, camera_id in itertools.product((FRAMES, MATTES), layout.camera_ids):
+        folder = layout.folder / kind / camera_id
+        found = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
+        missing = sorted(expected - found)
+        if missing:
+            raise UserError(f"{folder / missing[0]}: missing ({len(missing)} of {layout.timesteps} are); {REMEDY}")
+
+
+def _is_valid(layout: FrameLayout, capture_hash: str) -> bool:
+    try:
+        stamp = read_json(layout.folder / CACHE / "stamp.json", _FORMAT, _VERSION)
+        sizes = [layout.raw(kind).stat().st_size for kind in (FRAMES, MATTES)]
+    except (UserError, OSError):
+        return False
+    return (
+        stamp.get("capture_hash") == capture_hash
+        and sizes == [layout.raw_size(kind) for kind in (FRAMES, MATTES)]
+        and stamp.get("fingerprint") == _fingerprint(layout)
+    )
+
+
+def _fingerprint(layout: FrameLayout) -> str:
+    """Hash of the sizes and modification times of the cache and of all PNGs, which is cheap to compute."""
+    digest = hashlib.sha256()
+    for kind in (FRAMES, MATTES):
+        paths: list[Path] = [layout.raw(kind)]
+        for camera_id in layout.camera_ids:
+            folder = layout.folder / kind / camera_id
+            paths += [folder / f"{timestep:06d}.png" for timestep in range(layout.timesteps)]
+        for path in paths:
+            status = path.stat()
+            digest.update(f"{status.st_size} {status.st_mtime_ns};".encode())
+    return digest.hexdigest()
+
+
+def _rebuild(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> FrameLayout:
+    """Decode everything into the cache, or into a scratch folder if the capture's own cache cannot be written now.
+
+    Other processes may have the old cache mapped, so new files are made aside and then renamed. A lock lets only one
+    process write at a time.
+    """
+    for kind in (FRAMES, MATTES):  # A wrong size in `capture.json` fails here, before disk space is allocated.
+        read_png(layout.png(kind, 0, 0), layout.shape(kind)[2:], int(digests[kind][0, 0]))
+    try:
+        drop_if_shared(layout.folder / CACHE)
+        with hold(layout.raw(FRAMES)):
+            if not _is_valid(layout, capture_hash):
+                _replace_cache(layout, digests)
+                stamp_cache(layout, capture_hash)
+        return layout
+    except (OSError, BeingWrittenError):
+        scratch = replace(layout, folder=Path(tempfile.mkdtemp(prefix="mien-capture-")))
+        try:
+            _decode_all(layout, scratch, digests)
+        except BaseException as error:
+            remove_tree(scratch.folder)
+            if isinstance(error, OSError):
+                raise CannotWriteError(
+                    f"{layout.folder}: no room for the decoded frames ({error.strerror}); free some disk space", error
+                ) from None
+            raise
+        return scratch
+
+
+def _replace_cache(layout: FrameLayout, digests: dict[str, np.ndarray]) -> None:
+    cache = layout.folder / CACHE
+    for left in cache.glob(f"{_ASIDE_PREFIX}*"):  # left by a process that was killed
+        remove_tree(left)
+    for old in (cache / "stamp.json", layout.raw(FRAMES), layout.raw(MATTES)):  # the disk may have no room for both
+        old.unlink(missing_ok=True)
+    aside = replace(layout, folder=Path(tempfile.mkdtemp(dir=cache, prefix=_ASIDE_PREFIX)))
+    try:
+        _decode_all(layout, aside, digests)
+        for kind in (FRAMES, MATTES):
+            aside.raw(kind).replace(layout.raw(kind))
+    finally:
+        remove_tree(aside.folder)
+
+
+def _decode_all(source: FrameLayout, target: FrameLayout, digests: dict[str, np.ndarray]) -> None:
+    writer = CacheWriter(target)
+
+    def decode(place: tuple[str, int, int]) -> None:
+        kind, timestep, camera = place
+        path = source.png(kind, timestep, camera)
+        picture = read_png(path, source.shape(kind)[2:], int(digests[kind][timestep, camera]))
+        writer.write(kind, timestep, camera, np.ascontiguousarray(picture))
+
+    everything = list(itertools.product((FRAMES, MATTES), range(source.timesteps), range(len(source.camera_ids))))
+    threads = ThreadPoolExecutor(2)
+    try:
+        with progress_bar(f"decode {source.folder.name}", len(everything)) as advance:
+            for _ in threads.map(decode, everything):
+                advance()
+    finally:
+        threads.shutdown(wait=True, cancel_futures=True)
+        writer.close()

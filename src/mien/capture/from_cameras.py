@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,15 @@ from jaxtyping import Float
 
 from mien.camera import Camera
 from mien.capture.cameras.calibration import CalibratedCamera, match_sources, read_calibration
-from mien.capture.cameras.calibration_check import advise_on, landmarks_at, some_timesteps, warn_of_misfit
 from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path
+from mien.capture.cameras.readings import advise_on, landmarks_at, some_timesteps, warn_of_misfit
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
 from mien.capture.from_video import (
     RECIPE,
     STATE,
     CaptureJob,
+    capture_once,
     check_place,
     cleaning_up,
     open_job,
@@ -29,28 +31,21 @@ from mien.capture.parts import Part, check_one_size
 from mien.capture.person.backend import detector_entry
 from mien.capture.person.crop import Crop
 from mien.capture.person.faces import LANDMARKS
-from mien.capture.person.given import read_given, with_own_alpha
+from mien.capture.person.given import with_own_alpha
 from mien.capture.person.people import Person, choose_person
-from mien.capture.person.survey import Survey, survey_source
-from mien.capture.person.video_kind import kind_report, tell_fields, tell_kind
-from mien.capture.process import Chunk, Reel, process_part
-from mien.capture.quality import MEASURES, FrameQuality, quality_report, relative_quality
-from mien.capture.room import check_room
+from mien.capture.person.survey import Survey, kind_report, survey_source, tell_fields, tell_kind
+from mien.capture.process import Chunk, FrameStream, join_chunks, join_digests, origin_of, process_part
+from mien.capture.quality import MEASURES, FrameQuality, frame_rate, quality_report, relative_quality, tell_pauses
 from mien.capture.settings import CaptureSettings
-from mien.capture.store import CaptureData, finish_capture, partial_folder, read_capture
+from mien.capture.store import check_room, finish_capture, partial_folder, read_capture
 from mien.disk.files import file_digest
 from mien.disk.inside import remove_tree
-from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.machine.progress import say
-from mien.media.pace import frame_rate, tell_pauses
 
 _LANDMARKS_MOST_ASTRAY = 1.0
 """Largest distance between landmarks and the projected head, in sides of the landmarks' box. Farther ones are taken for
 a false face, for example in hair seen from behind."""
-
-_MAX_RATE_ERROR = 0.01
-"""Largest relative difference between the cameras' frame rates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +81,8 @@ def capture_cameras(
         calibration: json file of the cameras (`mien.capture.cameras.calibration.read_calibration`).
         out: the capture's folder. A capture of the same sources in it is replaced; anything else is refused.
         name: name of the sequence.
-        settings: settings of the capture. Mattes, landmarks and clean plates are folders with a file or folder for each
-            camera, named by its id. Cuts are not searched.
+        settings: mattes, landmarks and clean plates are folders with a file or folder for each camera, named by its
+            id. Cuts are not searched.
         replace_others: whether a capture of other sources may be replaced.
     """
     settings = settings or CaptureSettings()
@@ -97,19 +92,16 @@ def capture_cameras(
     for job, camera in zip(jobs, cameras, strict=True):
         _check_size(job, camera)
     whole = _joined(jobs, cameras, name, file_digest(calibration))
-    capture = read_finished(out, whole.key, tell=False)
-    if capture is not None:
-        return capture
-    _check_lengths(jobs, cameras)
-    with hold(out):
-        capture = read_finished(out, whole.key)
-        if capture is not None:
-            return capture
+
+    def work() -> Capture:
+        _check_lengths(jobs, cameras)
         check_place(out, whole)
         with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
             views = _survey_views(jobs, cameras, prepare(survey_folder, whole.key))
             _capture_views(views, whole, settings, out)
-    return read_capture(out)
+        return read_capture(out)
+
+    return capture_once(out, partial(read_finished, out, whole.key), work)
 
 
 def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool) -> CaptureJob:
@@ -136,10 +128,7 @@ def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
 
 
 def _check_lengths(jobs: list[CaptureJob], cameras: list[CalibratedCamera]) -> None:
-    """Check the numbers of frames before faces are searched, without decoding any.
-
-    Times decide which frames are taken if there is a --capture.start or --capture.end; the survey finds those.
-    """
+    """Check the numbers of frames without decoding any. With --capture.start or --capture.end, times decide."""
     selections = [job.frames.selection for job in jobs]
     if any(selection.start or selection.end for selection in selections):
         return
@@ -172,29 +161,28 @@ def _file_of(folder: Path, camera_id: str, option: str) -> Path:
 
 def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str) -> CaptureJob:
     """Return the job of the whole: the first camera's, under the sequence's name and a key over all of them."""
-    content = {"recipe": RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
-    if any(camera.lens for camera in cameras):
-        content["straightened"] = True  # Captures by versions that ignored `distortion` are made again.
-    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    contents = hashlib.sha256("".join(job.frames.content_hash for job in jobs).encode()).hexdigest()
-    frames = replace(jobs[0].frames, content_hash=contents)
     rates = [job.frames.fps for job in jobs]
     for camera, rate in zip(cameras, rates, strict=True):
-        if abs(rate - rates[0]) > _MAX_RATE_ERROR * rates[0]:
+        if abs(rate - rates[0]) > 0.01 * rates[0]:
             raise UserError(
                 f"camera {camera.camera_id} has {rate:g} frames a second, camera {cameras[0].camera_id} {rates[0]:g}; "
                 "frames are paired by their number, so give videos of one rate"
             )
-    return replace(jobs[0], frames=frames, name=name, key=key)
+    content = {"recipe": RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
+    if any(camera.lens for camera in cameras):
+        content["straightened"] = True
+    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    contents = hashlib.sha256("".join(job.frames.content_hash for job in jobs).encode()).hexdigest()
+    return replace(jobs[0], frames=replace(jobs[0].frames, content_hash=contents), name=name, key=key)
 
 
 def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
     """Find the faces in all videos."""
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
-        landmarks = read_given(job.settings, job.frames).landmarks
+        given = job.given()
         tell_kind(job.frames)
-        survey = survey_source(job.frames, folder / camera.camera_id, landmarks, job.detector)
+        survey = survey_source(job.frames, folder / camera.camera_id, given.landmarks, job.detector)
         check_one_size(survey, job.frames.path)
         tell_fields(job.frames, survey)
         fitted = camera.for_pictures(*(int(side) for side in survey.picture_size))
@@ -222,19 +210,18 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
     ids = tuple(view.camera_id for view in views)
     layout = FrameLayout(work, ids, len(path.centers), height, width)
     check_room(layout, whole.name, out)
-    chunks = [
-        process_part(
-            Reel(view.job.frames),
-            Part(f"{whole.name}, camera {view.camera_id}", 0, view.survey, _agreed(view.person, path, index), crop),
-            with_own_alpha(read_given(view.job.settings, view.job.frames), view.job.frames, view.survey.transparent),
-            layout,
-            work / _chunks_of(view.camera_id),
-            index,
-            whole.detector,
-        )
-        for index, (view, crop) in enumerate(zip(views, crops, strict=True))
-    ]
-    _finish(views, whole, path, crops, layout, chunks, out)
+    parts, chunks = [], []
+    for index, (view, crop) in enumerate(zip(views, crops, strict=True)):
+        # Without faces that are somewhere else than the head.
+        agreed = path.agrees[:, index, None] | ~path.known[:, None]
+        person = replace(view.person, boxes=np.where(agreed, view.person.boxes, np.nan))
+        part = Part(f"{whole.name}, camera {view.camera_id}", 0, view.survey, person, crop)
+        parts.append(part)
+        frames = view.job.frames
+        given = with_own_alpha(view.job.given(), frames, view.survey.transparent)
+        folder = work / _chunks_of(view.camera_id)
+        chunks.append(process_part(FrameStream(frames), part, given, layout, folder, index, whole.detector))
+    _finish(views, whole, path, parts, layout, chunks, out)
 
 
 def _advice(views: list[_View], boxes: Float[np.ndarray, "t c 4"]) -> str:
@@ -242,100 +229,80 @@ def _advice(views: list[_View], boxes: Float[np.ndarray, "t c 4"]) -> str:
     timesteps = some_timesteps(np.isfinite(boxes[..., 0]))
     landmarks = np.full((len(timesteps), len(views), LANDMARKS, 2), np.nan)
     for index, view in enumerate(views):
-        given = read_given(view.job.settings, view.job.frames).landmarks
+        given = view.job.given().landmarks
         if given is None:
             landmarks[:, index] = landmarks_at(view.job.frames, boxes[:, index], timesteps, view.job.detector)
         else:
             landmarks[:, index] = given[view.survey.numbers[timesteps]]
-    calibrated = [view.calibrated for view in views]
-    return advise_on(calibrated, lambda index, camera: camera.for_pictures(*_size_of(views[index])), landmarks)
-
-
-def _size_of(view: _View) -> tuple[int, int]:
-    return view.camera.width, view.camera.height
-
-
-def _agreed(person: Person, path: HeadPath, camera: int) -> Person:
-    """Return the person without faces that are somewhere else than the head."""
-    return replace(person, boxes=np.where(path.agrees[:, camera, None] | ~path.known[:, None], person.boxes, np.nan))
+    calibrated, sizes = [view.calibrated for view in views], [(view.camera.width, view.camera.height) for view in views]
+    return advise_on(
+        calibrated,
+        lambda index, camera: camera.for_pictures(*sizes[index]),
+        landmarks,
+    )
 
 
 def _finish(
     views: list[_View],
     whole: CaptureJob,
     path: HeadPath,
-    crops: list[Crop],
+    parts: list[Part],
     layout: FrameLayout,
     chunks: list[list[Chunk]],
     out: Path,
 ) -> None:
-    calibration = tuple(_cropped(view.camera, crop) for view, crop in zip(views, crops, strict=True))
-    landmarks = _joined_arrays(chunks, "landmarks")
+    cameras = tuple(_cropped(view.camera, part.crop) for view, part in zip(views, parts, strict=True))
+    landmarks = join_chunks(chunks, "landmarks")
+    sizes = [(view.camera.width, view.camera.height) for view in views]
     warn_of_misfit(
         [view.calibrated for view in views],
-        lambda index, camera: _cropped(camera.for_pictures(*_size_of(views[index])), crops[index]),
+        lambda index, camera: _cropped(camera.for_pictures(*sizes[index]), parts[index].crop),
         landmarks,
     )
-    _remove_astray(landmarks, path, calibration)
-    quality = _quality(chunks)
-    timestamps = views[0].survey.timestamps
-    data = CaptureData(
+    _remove_astray(landmarks, path, cameras)
+    # The quality of each picture is relative to those of its own camera.
+    each = [relative_quality(np.concatenate([chunk.quality for chunk in camera])) for camera in chunks]
+    measures = (field.name for field in fields(FrameQuality))
+    quality = FrameQuality(*(np.concatenate([getattr(one, name) for one in each], axis=1) for name in measures))
+    timestamps, valid = views[0].survey.timestamps, np.isfinite(landmarks[..., 0, 0])
+    capture = Capture(
         name=whole.name,
         camera_ids=layout.camera_ids,
         fps=frame_rate(timestamps, whole.frames.fps),
         timestamps=timestamps,
+        images=layout.blank(FRAMES),
+        mattes=layout.blank(MATTES),
         landmarks=landmarks,
-        valid=np.isfinite(landmarks[..., 0, 0]),
-        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in calibration]).astype(np.float64),
+        valid=valid,
+        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64),
         source={
             "key": whole.key,
             "file": ", ".join(view.job.frames.path.name for view in views),
             "content_hash": whole.frames.content_hash,
             "cameras": {
-                view.camera_id: {
-                    "file": view.job.frames.path.name,
-                    "picture_size": view.survey.picture_size.tolist(),
-                    "crop": {"left": crop.left, "top": crop.top, "width": crop.crop_width, "height": crop.crop_height},
-                    "first_frame": int(view.survey.numbers[0]),
-                }
-                for view, crop in zip(views, crops, strict=True)
+                view.camera_id: {"file": view.job.frames.path.name, **origin_of(part)}
+                for view, part in zip(views, parts, strict=True)
             },
             **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
         },
-        calibration=calibration,
+        calibration=cameras,
         quality=quality,
     )
-    found = data.valid.sum(axis=0)
     report = {
         "frames": len(timestamps),
-        "frames_without_face": int((~data.valid.any(axis=1)).sum()),
-        "faces_by_camera": dict(zip(layout.camera_ids, found.tolist(), strict=True)),
+        "frames_without_face": int((~valid.any(axis=1)).sum()),
+        "faces_by_camera": dict(zip(layout.camera_ids, valid.sum(axis=0).tolist(), strict=True)),
         "kind_by_camera": {view.camera_id: kind_report(view.job.frames, view.survey) for view in views},
         **tell_pauses(whole.name, timestamps),
-        **quality_report(whole.name, quality, _joined_arrays(chunks, "quality").reshape(-1, MEASURES)),
+        **quality_report(whole.name, quality, join_chunks(chunks, "quality").reshape(-1, MEASURES)),
     }
-    digests = {FRAMES: _joined_arrays(chunks, "frame_digests"), MATTES: _joined_arrays(chunks, "matte_digests")}
-    digests = {kind: array.reshape(array.shape[:2]) for kind, array in digests.items()}
-    for scaffolding in (STATE, *map(_chunks_of, layout.camera_ids)):
-        remove_tree(layout.folder / scaffolding)
-    finish_capture(layout, out, data, digests, report)
-
-
-def _quality(chunks: list[list[Chunk]]) -> FrameQuality:
-    """Return the quality of all pictures, each relative to those of its own camera."""
-    each = [relative_quality(np.concatenate([chunk.quality for chunk in camera])) for camera in chunks]
-    return FrameQuality(
-        *(np.concatenate([getattr(q, field.name) for q in each], axis=1) for field in fields(FrameQuality))
-    )
+    for leftover in (STATE, *map(_chunks_of, layout.camera_ids)):
+        remove_tree(layout.folder / leftover)
+    finish_capture(layout, out, capture, join_digests(chunks), report)
 
 
 def _chunks_of(camera_id: str) -> str:
     return f"chunks-{camera_id}"
-
-
-def _joined_arrays(chunks: list[list[Chunk]], name: str) -> np.ndarray:
-    """Join an array of all chunks over time, and of all cameras along the second axis."""
-    return np.stack([np.concatenate([getattr(chunk, name) for chunk in camera]) for camera in chunks], axis=1)
 
 
 def _cropped(camera: Camera, crop: Crop) -> Camera:
@@ -345,7 +312,6 @@ def _cropped(camera: Camera, crop: Crop) -> Camera:
 
 def _remove_astray(landmarks: Float[np.ndarray, "t c l 2"], path: HeadPath, cameras: tuple[Camera, ...]) -> None:
     """Remove landmarks that were found far from the head, for example in hair seen from behind."""
-    assert landmarks.shape[2] == LANDMARKS
     for index, camera in enumerate(cameras):
         found = landmarks[:, index]
         inside = path.centers @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()

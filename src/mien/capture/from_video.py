@@ -5,28 +5,27 @@ Only a few frames are in memory at a time.
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, FrameLayout
-from mien.capture.outcome import CAMERA_ID, Origin, finish_part
-from mien.capture.parts import Part, check_one_size, find_parts, number_parts, whole_part
+from mien.capture.parts import Part, check_one_size, find_parts, number_parts, tell_who, whole_part
 from mien.capture.person.backend import Detector, choose_detector, detector_entry
 from mien.capture.person.given import GivenInputs, read_given, with_own_alpha
-from mien.capture.person.same_person import check_neighbors, face_shapes, group_people, tell_who
-from mien.capture.person.survey import Survey, check_upright, survey_source
-from mien.capture.person.video_kind import tell_fields, tell_kind
-from mien.capture.process import Chunk, Reel, process_part
-from mien.capture.room import check_room
+from mien.capture.person.people import face_shapes, group_people, shape_difference
+from mien.capture.person.survey import Survey, check_upright, survey_source, tell_fields, tell_kind
+from mien.capture.process import CAMERA_ID, Chunk, FrameStream, finish_part, origin_of, process_part
 from mien.capture.settings import CaptureSettings
-from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, partial_folder, read_capture
+from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, check_room, partial_folder, read_capture
 from mien.disk.files import cannot_write, file_digest, read_json, write_json
 from mien.disk.inside import check_tree, has_other_names, remove_tree
 from mien.disk.locks import hold
@@ -38,6 +37,8 @@ from mien.media.source import FrameSelection, FrameSource, open_source
 RECIPE = 7
 """Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
 STATE, _CHUNKS = "state.json", "chunks"
+_NEIGHBORS = 4  # most captures of a workspace that a new one is compared with
+_Result = TypeVar("_Result", Capture, list[Capture])
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,13 @@ class CaptureJob:
     name: str
     key: str
     replace: bool
+    """Whether a capture of another source may be replaced."""
     detector: Detector = "mediapipe"
+
+    def given(self) -> GivenInputs:
+        """Read what the user gave besides the source."""
+        settings = self.settings
+        return read_given(self.frames, settings.clean_plate, settings.mattes, settings.landmarks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,39 +79,32 @@ def capture_video(
 
     An `out` that was made earlier from the same source with the same settings is read back. Unfinished work of an
     interrupted run is kept beside `out` and continued; the result does not depend on interruptions. Memory use does not
-    grow with the length of the video.
-
-    Args:
-        source: video file or folder of images.
-        out: the capture's folder. A capture of the same source in it is replaced; anything else is refused.
-        settings: settings of the capture; the defaults if None.
-        name: name of the sequence; by default the source's name without its ending.
-        replace: whether a capture of another source may be replaced too.
-
-    Raises:
-        UserError: the source is no video or shows no face, or a folder cannot be written, is damaged or being written.
+    grow with the length of the video. A capture of the same source in `out` is replaced, and with `replace` one of
+    another source; anything else is refused. `name` is by default the source's name without its ending.
     """
     job = open_job(source, settings or CaptureSettings(), name, replace)
-    capture = read_finished(out, _part_key(job, 1, 1), tell=False)
-    if capture is not None:
-        return capture
-    with hold(out):
-        return _capture_whole(out, job)
+    return capture_once(out, partial(read_finished, out, _part_key(job, 1, 1)), partial(_capture_whole, out, job))
+
+
+def capture_once(folder: Path, read: Callable[[bool], _Result | None], work: Callable[[], _Result]) -> _Result:
+    """Return what is finished already, or else do the work under the folder's lock. `read` may tell of damage."""
+    finished = read(False)
+    if finished:
+        return finished
+    with hold(folder):
+        # Another process may have finished it before this one got the lock.
+        return read(True) or work()
 
 
 def _capture_whole(out: Path, job: CaptureJob) -> Capture:
-    # Another process may have finished it before this one got the lock.
-    capture = read_finished(out, _part_key(job, 1, 1))
-    if capture is not None:
-        return capture
     check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
     with cleaning_up(out, scratch) as survey_folder:
-        given = read_given(job.settings, job.frames)
+        given = job.given()
         survey, given = _run_survey(job, survey_folder, given)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
         key = _part_key(job, 1, 1)
-        draft = _draft(job, Reel(job.frames), part, key, given, out)
+        draft = _draft(job, FrameStream(job.frames), part, key, given, out)
         if draft is not None:
             _finish(job, draft, key, (1, 1), given, out)
     return read_capture(out)
@@ -119,35 +119,19 @@ def capture_video_parts(
 ) -> list[Capture]:
     """Capture a video into `sequences`/NAME/capture, or, if it has cuts, each shot into NAME-1, NAME-2, ...
 
-    Each part is captured as by `capture_video`. The source is read only twice, however many parts there are.
-
-    Args:
-        source: video file or folder of images.
-        sequences: folder of the subject's sequences.
-        settings: settings of the capture; `cuts` decides whether cuts are searched.
-        name: NAME; by default the source's name without its ending.
-        replace: whether captures of another source may be replaced too.
-
-    Returns:
-        The captures in the video's order. The `name` of each is the name of its folder.
+    Each part is captured as by `capture_video`. The source is read only twice, however many parts there are. The
+    captures are returned in the video's order; the `name` of each is the name of its folder.
     """
     job = open_job(source, settings or CaptureSettings(), name, replace)
-    finished = _read_finished_parts(sequences, job, tell=False)
-    if finished:
-        return finished
-    with hold(sequences / job.name):
-        return _capture_parts(sequences, job)
+    read, work = (partial(each, sequences, job) for each in (_read_finished_parts, _capture_parts))
+    return capture_once(sequences / job.name, read, work)
 
 
 def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
-    # Another process may have finished them before this one got the lock.
-    finished = _read_finished_parts(sequences, job)
-    if finished:
-        return finished
     for first in (job.name, f"{job.name}-1"):
         check_place(_capture_dir(sequences, first), job)
     with cleaning_up(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
-        given = read_given(job.settings, job.frames)
+        given = job.given()
         survey, given = _run_survey(job, survey_folder, given)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
@@ -160,10 +144,10 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
 
 def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], given: GivenInputs) -> list[Part]:
     """Capture the parts that show the person of the settings, and return them under their final names."""
-    reel, drafts = Reel(job.frames), []
+    stream, drafts = FrameStream(job.frames), []
     for number, part in enumerate(parts, 1):
         out = _capture_dir(sequences, part.name)
-        drafts.append(_draft(job, reel, part, _part_key(job, number, len(parts)), given, out))
+        drafts.append(_draft(job, stream, part, _part_key(job, number, len(parts)), given, out))
     unfinished = [draft for draft in drafts if draft is not None]
     if len(unfinished) == len(parts) and job.settings.person:
         # Parts that are finished were compared by the call that was interrupted.
@@ -198,6 +182,32 @@ def _kept(sequences: Path, job: CaptureJob, drafts: list[Draft]) -> list[Part]:
     first = drafts[max(kept, key=lambda index: parts[index].timesteps)]
     check_neighbors(sequences, job.name, job.frames.path, first.pictures(), job.detector)
     return number_parts([parts[index] for index in kept], job.name)
+
+
+def check_neighbors(
+    sequences: Path, name: str, path: Path, pictures: UInt8[np.ndarray, "t h w 3"], detector: Detector
+) -> None:
+    """Check that other captures of a workspace show the person of the pictures of the new capture `name`."""
+    shapes = None
+    for json_path in sorted(sequences.glob(f"*/capture/{JSON_NAME}"))[:_NEIGHBORS]:
+        folder = json_path.parent.parent
+        try:
+            other = read_capture(json_path.parent)
+        except UserError:
+            continue  # whoever uses it says what is wrong with it
+        if name in (folder.name, _part_in(other.source).get("of")):
+            continue
+        shapes = face_shapes(pictures, detector) if shapes is None else shapes
+        difference = shape_difference(shapes, face_shapes(other.images[:, 0], detector))
+        if difference is None:
+            continue
+        if difference <= 1:
+            return
+        raise UserError(
+            f"{path}: shows another person than {folder}: the shapes of their faces differ {difference:.1f} times as "
+            "much as those of one person do at most; give another workspace with --out, or --capture.person 0 if it is "
+            "the same person"
+        )
 
 
 def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> CaptureJob:
@@ -239,9 +249,7 @@ def _read_finished_parts(sequences: Path, job: CaptureJob, tell: bool = True) ->
     whole = read_finished(_capture_dir(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
-    source = _read_source(_capture_dir(sequences, f"{job.name}-1")) or {}
-    part = source.get("part")
-    count = part.get("count") if isinstance(part, dict) else None
+    count = _part_in(_read_source(_capture_dir(sequences, f"{job.name}-1"))).get("count")
     if not isinstance(count, int):
         return []
     found: list[Capture] = []
@@ -296,22 +304,16 @@ def prepare(work: Path, key: str) -> Path:
     """Prepare a folder for unfinished work. Its content is kept only if it belongs to the same key."""
     try:
         kept = read_json(work / STATE, "mien.capture_state", 1).get("key") == key
+        # Links could make mien write somewhere else, and mien never makes any.
+        check_tree(work)
+        kept = kept and not work.is_symlink() and not has_other_names(work)
     except UserError:
         kept = False
-    if not kept or _leads_out(work):
+    if not kept:
         remove_tree(work)
         work.mkdir(parents=True)
         write_json(work / STATE, "mien.capture_state", 1, {"key": key})
     return work
-
-
-def _leads_out(work: Path) -> bool:
-    """Whether links in the unfinished work could make mien write somewhere else. mien never makes such links."""
-    try:
-        check_tree(work)
-        return work.is_symlink() or has_other_names(work)
-    except UserError:
-        return True
 
 
 def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Survey, GivenInputs]:
@@ -327,28 +329,33 @@ def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Surv
     return survey, given
 
 
-def _draft(job: CaptureJob, reel: Reel, part: Part, key: str, given: GivenInputs, out: Path) -> Draft | None:
+def _draft(job: CaptureJob, stream: FrameStream, part: Part, key: str, given: GivenInputs, out: Path) -> Draft | None:
     """Write the frames and mattes of a part beside `out`, or return None if the part is finished."""
     if read_finished(out, key) is not None:
         return None
     work = prepare(partial_folder(out), key)
     layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
     check_room(layout, part.name, out)
-    return Draft(part, layout, process_part(reel, part, given, layout, work / _CHUNKS, detector=job.detector))
+    return Draft(part, layout, process_part(stream, part, given, layout, work / _CHUNKS, detector=job.detector))
 
 
 def _finish(job: CaptureJob, draft: Draft, key: str, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
     detector = job.detector if given.landmarks is None else "mediapipe"
-    origin = Origin(job.frames, key, job.name, place, detector)
-    finish_part(draft.layout, out, draft.chunks, draft.part, origin, (STATE, _CHUNKS))
+    source = {
+        "key": key,
+        "file": job.frames.path.name,
+        "content_hash": job.frames.content_hash,
+        **origin_of(draft.part),
+        "part": {"of": job.name, "number": place[0], "count": place[1]},
+        **detector_entry(detector),
+    }
+    finish_part(draft.layout, out, draft.chunks, draft.part, job.frames, source, (STATE, _CHUNKS))
 
 
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:
     """Warn about sequences that an earlier capture of the same video left under other names."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
-        source = _read_source(path.parent) or {}
-        part = source.get("part")
-        is_ours = isinstance(part, dict) and part.get("of") == job.name
+        is_ours = _part_in(_read_source(path.parent)).get("of") == job.name
         if is_ours and path.parent.parent.name not in names:
             say(
                 f"warning: {path.parent.parent}: is left over from an earlier capture of {job.name}; "
@@ -363,6 +370,12 @@ def _read_source(out: Path) -> dict[str, Any] | None:
     except UserError:
         return None
     return source if isinstance(source, dict) else None
+
+
+def _part_in(source: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the entry of a capture's `source` about the video that it is a part of, if it has one."""
+    part = (source or {}).get("part")
+    return part if isinstance(part, dict) else {}
 
 
 def read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:

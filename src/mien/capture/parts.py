@@ -1,6 +1,9 @@
 """Step 3: choose the parts of a video that become captures, one for each shot, with its own person and crop."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +24,10 @@ _CUT_NEIGHBORS = 4
 """Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
 _CUT_LEAST_CHANGE = 0.05  # smallest change at a cut, as a fraction of the mean brightness
 _CUT_LEAST_CONTRAST = 3.0  # factor by which the change at a cut exceeds the changes beside it
+_FACELESS = "parts without a face"
 _CUT_BLOCKS = (3, 4)
 """Rows and columns of blocks. The change is that of half of the blocks, or of the face's place if that is larger. The
 quarter that changes most also has captions in it, which cost 47 to 67 % of the frames of such videos."""
-
-_MANY_LEFT_OUT = 0.1
-"""Share of the frames in parts that are left out from which on that is a warning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     bounds = sorted({0, *cuts, *turns, len(survey.timestamps)})
     interval = float(np.median(np.diff(survey.timestamps))) if len(survey.timestamps) > 1 else 0.0
     short, faceless, found = [], [], []
-    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+    for start, stop in itertools.pairwise(bounds):
         seconds = float(survey.timestamps[stop - 1] - survey.timestamps[start]) + interval
         # Tolerate half a frame: 25 frames at 25 per second last a second.
         if len(bounds) > 2 and seconds < settings.shortest_part - interval / 2:
@@ -92,7 +93,10 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
         )
     if not found:
         raise no_face(path, len(survey.timestamps))
-    _tell_left_out(path, survey, short, faceless, settings)
+    keeps = "--capture.shortest-part keeps shorter ones" + ("" if turns else ", --capture.no-cuts all")
+    _tell_left_out(
+        path, survey, {f"parts shorter than {settings.shortest_part:g} s": short, _FACELESS: faceless}, keeps
+    )
     parts = number_parts(found, name)
     if cuts:
         say(f"{path}: cuts to another shot at {_list_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
@@ -116,30 +120,17 @@ def _change_of_size(survey: Survey, frame: int) -> str:
     return f"the picture changes from {before} to {after} at {_list_times(survey, [frame])}"
 
 
-def _tell_left_out(
-    path: Path,
-    survey: Survey,
-    short: list[tuple[int, int]],
-    faceless: list[tuple[int, int]],
-    settings: CaptureSettings,
-) -> None:
-    """Say which frames belong to no part. It is a warning if they are many."""
+def _tell_left_out(path: Path, survey: Survey, left_out: dict[str, list[tuple[int, int]]], keeps: str) -> None:
+    """Say which frames belong to no part, by the reason. It is a warning if they are more than a tenth."""
     total = len(survey.timestamps)
-    many = sum(stop - start for start, stop in short + faceless) > _MANY_LEFT_OUT * total
-    least = f"{settings.shortest_part:g} s"
-    keeps = "--capture.shortest-part keeps shorter ones" + (
-        "" if survey.changes_of_shape() else ", --capture.no-cuts all"
-    )
-    for spans, why, remedy in (
-        (short, f"parts shorter than {least}", keeps),
-        (faceless, "parts without a face", ""),
-    ):
+    many = sum(stop - start for spans in left_out.values() for start, stop in spans) > 0.1 * total
+    for why, spans in left_out.items():
         if spans:
             frames = sum(stop - start for start, stop in spans)
             at = _list_times(survey, [start for start, _ in spans])
             say(
                 f"{'warning: ' if many else ''}{path}: {len(spans)} {why} are left out, at {at}: {frames} of "
-                f"{counted(total, 'frame')}{f'; {remedy}' if remedy and many else ''}"
+                f"{counted(total, 'frame')}{f'; {keeps}' if many and why != _FACELESS else ''}"
             )
 
 
@@ -154,14 +145,10 @@ def _make_part(survey: Survey, start: int, settings: CaptureSettings, name: str)
     person = choose_person(survey)
     if not person.seen.any():
         return None
-    return Part(name, start, survey, person, _choose_crop(survey, person, settings))
-
-
-def _choose_crop(survey: Survey, person: Person, settings: CaptureSettings) -> Crop:
     width, height = survey.picture_size.tolist()
-    if settings.crop == "none":
-        return whole_picture(width, height, settings.size)
-    return choose_crop(person.boxes, width, height, settings.size)
+    whole = settings.crop == "none"
+    crop = (whole_picture if whole else partial(choose_crop, person.boxes))(width, height, settings.size)
+    return Part(name, start, survey, person, crop)
 
 
 def _tell_people(path: Path, part: Part) -> None:
@@ -176,6 +163,24 @@ def _tell_people(path: Path, part: Part) -> None:
     )
 
 
+def tell_who(path: Path, parts: Sequence[Part], people: Sequence[Sequence[int]], person: int) -> None:
+    """Say which parts of the video (as indices) show whom, and who is kept, if there are several people."""
+    if person > len(people):
+        shown = "one person" if len(people) == 1 else f"{len(people)} people"
+        raise UserError(f"--capture.person {person}: {path} shows {shown}; give a smaller number")
+    if len(people) == 1:
+        return
+    seen = []
+    for number, places in enumerate(people, 1):
+        begins = ", ".join(f"{parts[place].survey.timestamps[0]:.1f}" for place in places[:5])
+        frames = sum(parts[place].timesteps for place in places)
+        seen.append(f"person {number} from {begins}{', ...' if len(places) > 5 else ''} s ({counted(frames, 'frame')})")
+    say(
+        f"warning: {path}: shows {len(people)} people, by the shapes of their faces: {'; '.join(seen)}. "
+        f"Person {person} is kept; choose with --capture.person N, where 0 takes all for one person"
+    )
+
+
 def _list_times(survey: Survey, frames: list[int]) -> str:
     """List the times of up to five frames, for messages."""
     listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
@@ -187,11 +192,7 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"], faces: Float[np.ndarray,
 
     A cut is a change of most of the picture, or of the places of all faces. It is much larger than the changes beside
     it, and the next frames do not undo it. A light that is switched on is no cut. Neither is a caption or a window that
-    appears beside a face, or a person who leaves another one.
-
-    Args:
-        thumbnails: the pictures.
-        faces: left, top, right, bottom of the faces as fractions of each picture, NaN where there are fewer.
+    appears beside a face, or a person who leaves another one. `faces` are their boxes as fractions of each picture.
     """
     pictures = thumbnails.astype(np.float32)
     boxes = np.full((len(pictures), 1, 4), np.nan) if faces is None else faces
@@ -203,8 +204,10 @@ def find_cuts(thumbnails: UInt8[np.ndarray, "t h w 3"], faces: Float[np.ndarray,
         )
         # The largest neighbour may be the other half of a cut that passes through a blended frame.
         loudest = np.sort(beside)[-2] if len(beside) > 1 else 0.0
-        stands_out = changes[index] > _CUT_LEAST_CONTRAST * loudest
-        if stands_out and _parted(pictures, boxes, index + 1) > 0.5 * changes[index]:
+        if (
+            changes[index] > _CUT_LEAST_CONTRAST * loudest
+            and _parted(pictures, boxes, index + 1) > 0.5 * changes[index]
+        ):
             cuts.append(index + 1)
     return cuts
 

@@ -2,32 +2,36 @@
 
 import itertools
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt64
 
+from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
 from mien.capture.parts import Part
 from mien.capture.person.backend import DetectorChoice
 from mien.capture.person.crop import Crop
-from mien.capture.person.faces import LANDMARKS, LandmarkDetector
+from mien.capture.person.faces import LANDMARKS, LandmarkDetector, second_difference_jitter
 from mien.capture.person.given import GivenInputs
-from mien.capture.person.matte import MakeMatte, choose_matting
-from mien.capture.person.matte_owner import held, without_others
+from mien.capture.person.matte import MakeMatte, choose_matting, held, without_others
 from mien.capture.person.people import Person
-from mien.capture.person.screen import screen_of, without_screen
-from mien.capture.person.survey import Survey
-from mien.capture.quality import MEASURES, measure_face
+from mien.capture.person.plate import screen_of, without_screen
+from mien.capture.person.survey import Survey, kind_report, no_face
+from mien.capture.quality import MEASURES, frame_rate, measure_face, pace_report, quality_report, relative_quality
+from mien.capture.store import finish_capture
 from mien.disk.files import expect_whole, read_arrays, write_arrays
+from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import brought_to
-from mien.media.source import FrameSource, SourceFrame
+from mien.media.source import FrameSource
+from mien.media.video import LazyFrame
 
 _MATTE_HELD_FRAMES = 12  # frames before and after in which another face still counts where it is not found
 _LEAD_IN = 8
@@ -37,9 +41,7 @@ _FACE_MOST_DISTANCE = 0.6
 """Largest distance between the centres of landmarks and of the followed face, as a part of the face's longer side: it
 refuses no good face (log)."""
 _FACE_MOST_AGE = 12  # frames for which the last landmarks predict the face's position if the survey did not find it
-
-CHUNK = 256
-"""Frames after which progress is saved. Detectors start again at each chunk, even if nothing is interrupted."""
+CHUNK = 256  # frames after which progress is saved. Detectors start again at each, even if nothing is interrupted
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,7 @@ class Chunk:
         return np.isfinite(self.landmarks[:, 0, 0])
 
 
-class Reel:
+class FrameStream:
     """The frames of a source, read once and in order."""
 
     def __init__(self, frames: FrameSource) -> None:
@@ -69,7 +71,7 @@ class Reel:
         self._stream = frames.frames()
         self._position = 0
 
-    def from_frame(self, start: int) -> Iterator[SourceFrame]:
+    def from_frame(self, start: int) -> Iterator[LazyFrame]:
         """Yield the frames from index `start` (among those taken) on. They must not have been read yet."""
         assert start >= self._position, (start, self._position)
         for _ in itertools.islice(self._stream, start - self._position):
@@ -116,8 +118,8 @@ class LandmarkFollower:
     def _nearest(faces: np.ndarray, expected: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "l 2"] | None:
         if not len(faces):
             return None
-        centers = np.array([_center(_box(face)) for face in faces])
-        distances = np.linalg.norm(centers - _center(expected), axis=1)
+        centers = (faces.min(axis=1) + faces.max(axis=1)) / 2
+        distances = np.linalg.norm(centers - (expected[:2] + expected[2:]) / 2, axis=1)
         best = int(np.argmin(distances))
         if distances[best] > _FACE_MOST_DISTANCE * (expected[2:] - expected[:2]).max():
             return None
@@ -134,22 +136,20 @@ def _box(landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " 4"]:
     return np.concatenate([landmarks.min(axis=0), landmarks.max(axis=0)])
 
 
-def _center(box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 2"]:
-    return (box[:2] + box[2:]) / 2
-
-
 class PartProcessor:
     """Processes the frames of one part in order, a chunk at a time."""
 
-    def __init__(self, reel: Reel, part: Part, given: GivenInputs, done: int, detector: DetectorChoice) -> None:
+    def __init__(
+        self, stream: FrameStream, part: Part, given: GivenInputs, done: int, detector: DetectorChoice
+    ) -> None:
         """Prepare to process the part, skipping its first `done` frames."""
-        self._path, self._part, self._given = reel.path, part, given
+        self._path, self._part, self._given = stream.path, part, given
         self._detector: DetectorChoice = detector
         others = held(part.person.others, _MATTE_HELD_FRAMES) * np.tile(part.survey.picture_size, 2)
         self._others = _to_crop(others, part.crop)
         begin = done - _LEAD_IN if done >= _LEAD_IN else 0
         left = part.timesteps - begin
-        self._stream = itertools.islice(reel.from_frame(part.start + begin), left)
+        self._stream = itertools.islice(stream.from_frame(part.start + begin), left)
         self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=_LEAD_IN)
         """Timesteps and pictures of the latest frames; before the first frame, of the next ones in reverse order."""
         self._keys = given.plate is None and given.mattes is None
@@ -157,8 +157,13 @@ class PartProcessor:
             ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, _LEAD_IN + 1)]
             self._recent.extend((index, image) for index, (_, image) in reversed(list(enumerate(ahead))[1:]))
             self._pictures = itertools.chain(ahead, map(self._cropped, self._stream))
-            if self._keys:
-                _tell_screen(part.name, screen_of(ahead[0][1]))
+            screen = screen_of(ahead[0][1]) if self._keys else None
+            if screen is not None:
+                red, green, blue = (round(255 * float(level)) for level in screen)
+                say(
+                    f"{part.name}: the background is an even screen (red {red}, green {green}, blue {blue} of 255); it "
+                    "gives the mattes, and its light is taken off the edges; give --capture.mattes if they are wrong"
+                )
         else:
             self._pictures = map(self._cropped, self._stream)
         before = itertools.islice(self._pictures, done - begin)
@@ -176,17 +181,22 @@ class PartProcessor:
             if self._given.landmarks is None:
                 detector = stack.enter_context(LandmarkDetector(bool(part.person.crowded.any()), self._detector))
                 follower = LandmarkFollower(detector, part.survey, part.person, part.crop)
-            matting = choose_matting(stack, part.crop, self._given.plate, self._given.mattes, self._detector)
+            prepare = choose_matting(stack, part.crop, self._given.plate, self._given.mattes, self._detector)
             for timestep, image in self._recent:
                 if follower is not None:
                     follower.find(timestep, image)
-                matting.warm_up(image)
+                if self._given.mattes is None:
+                    prepare(0, image)
             for index, (number, image) in enumerate(itertools.islice(self._pictures, count)):
                 timestep = start + index
-                found = self._given_landmarks(timestep, number) if follower is None else follower.find(timestep, image)
+                found = None
+                if follower is not None:
+                    found = follower.find(timestep, image)
+                elif self._given.landmarks is not None and part.person.seen[timestep]:
+                    found = part.crop.to_output(self._given.landmarks[number])
                 if found is not None:
                     landmarks[index] = found
-                make_matte = matting.prepare(number, image)
+                make_matte = prepare(number, image)
                 if self._given.mattes is None and found is not None:
                     make_matte = partial(_own_matte, make_matte, found, self._others[timestep], taken_off[index:][:1])
                 screen = screen_of(image) if self._keys else None
@@ -201,38 +211,20 @@ class PartProcessor:
         span = slice(start, start + count), slice(camera, camera + 1)
         return Chunk(landmarks, quality, taken_off, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
-    def _cropped(self, frame: SourceFrame) -> tuple[int, np.ndarray]:
+    def _cropped(self, frame: LazyFrame) -> tuple[int, np.ndarray]:
         width, height = self._part.survey.picture_size.tolist()
         return frame.number, self._part.crop.apply(brought_to(frame.picture(), (width, height)))
-
-    def _given_landmarks(self, timestep: int, number: int) -> Float[np.ndarray, "l 2"] | None:
-        """Return the user's landmarks, or None if the followed person is not seen."""
-        assert self._given.landmarks is not None
-        return self._part.crop.to_output(self._given.landmarks[number]) if self._part.person.seen[timestep] else None
 
 
 def _read(path: Path) -> Chunk:
     """Read a chunk that an interrupted call saved."""
     arrays = read_arrays(path)
     with expect_whole(path, "delete its folder and run `mien capture` again"):
-        t = len(arrays["landmarks"])
-        if (
-            not 0 < t <= CHUNK
-            or arrays["landmarks"].shape[1:] != (LANDMARKS, 2)
-            or arrays["quality"].shape != (t, MEASURES)
-        ):
-            raise ValueError("landmarks or quality of another size")
-        if arrays["taken_off"].shape != (t,):
-            raise ValueError("pixels taken off of another number")
-        if any(arrays[name].shape != (t, 1) for name in ("frame_digests", "matte_digests")):
-            raise ValueError("digests of another number")
-        if len({len(array) for array in arrays.values()}) > 1:
-            raise ValueError("arrays of several lengths")
         return Chunk(**arrays)
 
 
 def process_part(
-    reel: Reel,
+    stream: FrameStream,
     part: Part,
     given: GivenInputs,
     layout: FrameLayout,
@@ -240,36 +232,20 @@ def process_part(
     camera: int = 0,
     detector: DetectorChoice = "auto",
 ) -> list[Chunk]:
-    """Process all frames of a part, as those of one camera of the layout.
-
-    Chunks that an interrupted call left in the folder `work` are kept.
-
-    Raises:
-        UserError: the source cannot be decoded.
-        OSError: the frames cannot be written.
-    """
+    """Process a part as one camera of the layout. Chunks that an interrupted call left in `work` are kept."""
     work.mkdir(exist_ok=True)
     paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, CHUNK)}
     chunks = [_read(path) for path in itertools.takewhile(Path.exists, paths.values())]
     done = sum(len(chunk.valid) for chunk in chunks)
     if done == layout.timesteps:
         return chunks
-    processor = PartProcessor(reel, part, given, done, detector)
+    processor = PartProcessor(stream, part, given, done, detector)
     with FrameWriter(layout, camera) as writer, progress_bar(f"capture {part.name}", layout.timesteps, done) as advance:
         for start, path in itertools.islice(paths.items(), len(chunks), None):
             chunk = processor.process(start, min(CHUNK, layout.timesteps - start), writer, camera, advance)
             write_arrays(path, vars(chunk))
             chunks.append(chunk)
     return chunks
-
-
-def _tell_screen(name: str, screen: np.ndarray | None) -> None:
-    if screen is not None:
-        red, green, blue = (round(255 * float(level)) for level in screen)
-        say(
-            f"{name}: the background is an even screen (red {red}, green {green}, blue {blue} of 255); it gives the "
-            "mattes, and its light is taken off the edges; give --capture.mattes if they are wrong"
-        )
 
 
 def _own_matte(make: MakeMatte, landmarks: np.ndarray, others: np.ndarray, taken_off: np.ndarray) -> np.ndarray:
@@ -287,11 +263,84 @@ def _finish(
     quality: np.ndarray,
     screen: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return picture and matte for the disk, and write the picture's quality into `quality`.
-
-    A picture before a screen is stored without it.
-    """
+    """Return picture (without a screen) and matte for the disk, and write the picture's quality into `quality`."""
     if np.isfinite(landmarks[0, 0]):
         quality[:] = measure_face(image, landmarks)
     matte = make_matte()
     return (image if screen is None else without_screen(image, matte, screen))[None], matte[None]
+
+
+CAMERA_ID = "0"
+
+
+def join_chunks(chunks: Sequence[Sequence[Chunk]], name: str) -> np.ndarray:
+    """Join an array of the chunks of each camera over time, and of all cameras along the second axis."""
+    return np.stack([np.concatenate([getattr(chunk, name) for chunk in camera]) for camera in chunks], axis=1)
+
+
+def join_digests(chunks: Sequence[Sequence[Chunk]]) -> dict[str, UInt64[np.ndarray, "t c"]]:
+    """Return the digests of all frames and mattes."""
+    names = {FRAMES: "frame_digests", MATTES: "matte_digests"}
+    return {kind: join_chunks(chunks, name)[..., 0] for kind, name in names.items()}
+
+
+def origin_of(part: Part) -> dict[str, Any]:
+    """Return what a capture's `source` says about the pictures of a camera."""
+    crop = part.crop
+    return {
+        "picture_size": part.survey.picture_size.tolist(),
+        "crop": {"left": crop.left, "top": crop.top, "width": crop.crop_width, "height": crop.crop_height},
+        "first_frame": int(part.survey.numbers[0]),
+    }
+
+
+def finish_part(
+    layout: FrameLayout,
+    out: Path,
+    chunks: list[Chunk],
+    part: Part,
+    frames: FrameSource,
+    source: dict[str, Any],
+    leftovers: tuple[str, ...],
+) -> None:
+    """Step 5: write the results of all frames beside them, remove `leftovers` in the folder and rename it to `out`.
+
+    `source` is the capture's, without what `origin_of` says.
+    """
+    landmarks, measured = (join_chunks([chunks], name) for name in ("landmarks", "quality"))
+    valid = np.isfinite(landmarks[..., 0, 0])
+    if not valid.any():
+        remove_tree(layout.folder)
+        raise no_face(frames.path, len(valid))
+    survey = part.survey
+    timestamps = survey.timestamps - survey.timestamps[0]
+    quality = relative_quality(measured[:, 0])
+    capture = Capture(
+        name=part.name,
+        camera_ids=layout.camera_ids,
+        fps=frame_rate(timestamps, frames.fps),
+        timestamps=timestamps,
+        images=layout.blank(FRAMES),
+        mattes=layout.blank(MATTES),
+        landmarks=landmarks,
+        valid=valid,
+        principal_point=part.crop.to_output(survey.picture_size / 2)[None],
+        source=source,
+        quality=quality,
+    )
+    jitter, missed = second_difference_jitter(landmarks[:, 0]), int((~valid).sum())
+    report = {
+        "frames": len(valid),
+        "frames_without_face": missed,
+        "frames_with_several_faces": int(part.person.crowded.sum()),
+        "matte_pixels_taken_off": round(float(np.concatenate([chunk.taken_off for chunk in chunks]).mean()), 1),
+        "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
+        **kind_report(frames, survey),
+        **pace_report(part.name, timestamps),
+    }
+    if missed:
+        say(f"{part.name}: no face in {missed} of {len(valid)} frames; they are left out")
+    report |= quality_report(part.name, quality, measured[:, 0])
+    for name in leftovers:
+        remove_tree(layout.folder / name)
+    finish_capture(layout, out, capture, join_digests([chunks]), report)

@@ -1,4 +1,4 @@
-"""Step 4: measure how sharp and how well lit the face is in every frame."""
+"""Measure a clip: how sharp and how well lit the face is in every frame, and the times between its frames."""
 
 import math
 from dataclasses import dataclass
@@ -21,21 +21,12 @@ _LEAST_LIGHT_CHANGE = 1.35
 """Factor by which the face's brightness changes over time from which the light counts as changing, and training learns
 a gain for each frame. Measured: seven clips in steady light have up to 1.17 (log)."""
 
-_DIRECTIONS = 4
-"""Directions in which detail is measured: across, down and both diagonals. Motion removes it only along itself."""
-_CHANNELS = 3
-MEASURES = _DIRECTIONS + 3 + _CHANNELS
-"""Number of values that `measure_face` returns."""
-_CLIPPED_LEVEL = 250
-"""Level (of 255) from which a channel counts as clipped."""
-_MIN_BRIGHTNESS = 0.18
-"""Mean level of the face (0..1, sRGB) below which a clip counts as dark."""
-_MAX_CLIPPED = 0.1
-"""Clipped part of the face above which a clip counts as over-exposed."""
-_SKIN_ROWS, _SKIN_COLUMNS = (0.1, 0.8), (0.15, 0.85)
-"""Rows and columns of the face's box that are mostly skin, as fractions."""
-_CELLS = 8
-"""Cells along each side of that part. The median over cells leaves out eyes, brows, mouth and glasses."""
+_DIRECTIONS = 4  # of detail: across, down and both diagonals. Motion removes it only along itself
+MEASURES = _DIRECTIONS + 6  # values that `measure_face` returns
+_MIN_BRIGHTNESS = 0.18  # mean level of the face (0..1, sRGB) below which a clip counts as dark
+_MAX_CLIPPED = 0.1  # clipped part of the face above which a clip counts as over-exposed
+_SKIN_ROWS, _SKIN_COLUMNS = (0.1, 0.8), (0.15, 0.85)  # of the face's box that are mostly skin, as fractions
+_CELLS = 8  # along each side of that part. The median over cells leaves out eyes, brows, mouth and glasses
 _MAX_CAST = 0.92
 """Level of green or blue, relative to red, from which skin counts as tinted. Skin has up to 0.85 of green and 0.83 of
 blue in seven clips, and up to 0.77 and 0.67 in ten drawn people (docs/log.md)."""
@@ -44,12 +35,8 @@ _MAX_NOISE = 0.025
 _LEAST_TINT_CHANGE = 1.2
 """Factor by which the skin's blue, relative to its red, changes over time from which the white balance counts as
 drifting. Ten clips have up to 1.12, also where the exposure changes by 2.4."""
-_LIGHT_RANGE = (5, 95)
-"""Percentiles of the face's brightness over time that are compared, so that single frames do not count."""
 _NOISE_KERNEL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)
 """Leaves out edges and shading. Its answer to noise of deviation 1 has deviation 6 (Immerkaer, 1996)."""
-_MIN_COLOR = 0.05
-"""Relative difference of the channels below which a picture counts as grey: black and white film has no cast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +59,7 @@ class FrameQuality:
 def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " m"]:
     """Return detail in each direction (arbitrary units), brightness, clipped part, noise, and the skin's colour.
 
-    Brightness, noise (a standard deviation) and colours are 0..1, sRGB.
-
-    They are NaN if the face lies outside the picture.
+    Brightness, noise (a standard deviation) and colours are 0..1, sRGB. All are NaN if the face is outside the picture.
     """
     height, width = image.shape[:2]
     left, top = np.clip(np.floor(landmarks.min(axis=0)), 0, [width, height]).astype(int)
@@ -82,8 +67,10 @@ def measure_face(image: UInt8[np.ndarray, "h w 3"], landmarks: Float[np.ndarray,
     if right - left < 2 or bottom - top < 2:
         return np.full(MEASURES, np.nan)
     face = image[top:bottom, left:right]
-    clipped = float((face.max(axis=-1) >= _CLIPPED_LEVEL).mean())
-    return np.array([*_detail(face), float(face.mean()) / 255, clipped, _noise(face), *_skin_color(face)])
+    clipped = float((face.max(axis=-1) >= 250).mean())
+    cells = cv2.resize(_skin(face), (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
+    color = np.median(cells.reshape(-1, 3), axis=0) / 255
+    return np.array([*_detail(face), float(face.mean()) / 255, clipped, _noise(face), *color])
 
 
 def _noise(face: UInt8[np.ndarray, "h w 3"]) -> float:
@@ -115,11 +102,6 @@ def _skin(face: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "p q 3"]:
     return face[top : max(bottom, top + 1), left : max(right, left + 1)]
 
 
-def _skin_color(face: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
-    cells = cv2.resize(_skin(face), (_CELLS, _CELLS), interpolation=cv2.INTER_AREA)
-    return np.median(cells.reshape(-1, _CHANNELS), axis=0) / 255
-
-
 def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
     """Return the quality of a clip's frames from the results of `measure_face`."""
     values = measured.astype(np.float32)
@@ -131,14 +113,11 @@ def relative_quality(measured: Float[np.ndarray, "t m"]) -> FrameQuality:
 
 
 def light_change(brightness: Float[np.ndarray, " n"]) -> float:
-    """Return by what factor the brightness of the face changes over pictures, 1 or more. NaN counts nowhere.
-
-    The darkest and the brightest twentieth of the pictures do not count.
-    """
+    """Return the factor, 1 or more, by which the face's brightness changes, without the extreme twentieths and NaN."""
     known = brightness[brightness > 0]  # NaN compares as not brighter.
     if not len(known):
         return 1.0
-    low, high = np.percentile(known, _LIGHT_RANGE)
+    low, high = np.percentile(known, (5, 95))
     return float(high / low)
 
 
@@ -148,37 +127,42 @@ def is_light_changing(brightness: Float[np.ndarray, " n"]) -> bool:
 
 
 def quality_report(name: str, quality: FrameQuality, measured: Float[np.ndarray, "n m"]) -> dict[str, Any]:
-    """Return figures for the capture's report, and tell the user what is wrong with the clip.
-
-    Args:
-        name: name of the capture, for messages.
-        quality: quality of all frames.
-        measured: results of `measure_face` for all pictures.
-    """
-    seen = np.isfinite(quality.brightness)
-    brightness, clipped = (
-        float(np.median(values[seen])) if seen.any() else 0.0 for values in (quality.brightness, quality.clipped)
-    )
+    """Return figures for the report from `measure_face` of all pictures, and tell what is wrong with the clip."""
+    brightness, clipped, noise = map(_median, (quality.brightness, quality.clipped, measured[:, _DIRECTIONS + 2]))
+    color = np.array([_median(channel) for channel in measured[:, -3:].T])
     blurred = np.flatnonzero(quality.blurred.any(axis=1)).tolist()
-    known = measured[np.isfinite(measured).all(axis=1)]
-    color = np.median(known[:, -_CHANNELS:], axis=0) if len(known) else np.zeros(_CHANNELS)
-    noise = float(np.median(known[:, _DIRECTIONS + 2])) if len(known) else 0.0
-    cast = find_cast(color)
-    is_dark, is_overexposed = brightness < _MIN_BRIGHTNESS, clipped > _MAX_CLIPPED
-    is_noisy = noise > _MAX_NOISE * brightness
     changing = max(quality.brightness.T, key=light_change)
-    change = light_change(changing)
     # The rows of rigs are those of several cameras, each with its own colours.
     tints = measured[:, -1] / np.maximum(measured[:, -3], 1e-3) if quality.brightness.shape[1] == 1 else np.ones(1)
-    hints = _hints(
-        brightness if is_dark else None,
-        clipped if is_overexposed else None,
-        cast,
-        color,
-        noise if is_noisy else None,
-        changing if is_light_changing(changing) else None,
-        tints if light_change(tints) > _LEAST_TINT_CHANGE else None,
-    )
+    faults = {
+        "dark": brightness < _MIN_BRIGHTNESS,
+        "overexposed": clipped > _MAX_CLIPPED,
+        "noisy": noise > _MAX_NOISE * brightness,
+        "changing_light": is_light_changing(changing),
+    }
+    cast = find_cast(color)
+    hints = []
+    if faults["dark"]:
+        hints.append(
+            f"the face is dark (mean level {brightness:.0%}); the avatar will be noisy; record the video again with "
+            "more light on the face"
+        )
+    if faults["overexposed"]:
+        hints.append(
+            f"the face is over-exposed ({clipped:.0%} of it is white); white parts have no detail; record the video "
+            "again with less exposure"
+        )
+    if cast:
+        hints.append(_cast_hint(cast, color))
+    if faults["noisy"]:
+        hints.append(
+            f"the pictures are noisy (a deviation of {255 * noise:.1f} of 255 levels in the skin); fine detail will be "
+            "missing; record the video again with more light on the face, and with the camera's gain (ISO) lower"
+        )
+    if faults["changing_light"]:
+        hints.append(_light_hint(changing))
+    if light_change(tints) > _LEAST_TINT_CHANGE:
+        hints.append(_tint_hint(tints))
     for hint in hints:
         say(f"warning: {name}: {hint}")
     if blurred:
@@ -189,18 +173,48 @@ def quality_report(name: str, quality: FrameQuality, measured: Float[np.ndarray,
         "frames_blurred": len(blurred),
         "blurred_frames": blurred,
         "face_brightness": round(brightness, 4),
-        "face_brightness_change": round(change, 3),
+        "face_brightness_change": round(light_change(changing), 3),
         "skin_tint_change": round(light_change(tints), 3),
         "face_noise": round(noise, 4),
         "face_clipped": round(clipped, 4),
         "skin_color": [round(float(level), 4) for level in color],
-        "dark": is_dark,
-        "overexposed": is_overexposed,
-        "noisy": is_noisy,
-        "changing_light": is_light_changing(changing),
+        **faults,
         "color_cast": cast or None,
         "hints": hints,
     }
+
+
+def _median(values: Float[np.ndarray, "*n"]) -> float:
+    seen = values[np.isfinite(values)]
+    return float(np.median(seen)) if len(seen) else 0.0
+
+
+def _cast_hint(cast: str, color: Float[np.ndarray, " 3"]) -> str:
+    red, green, blue = (round(255 * float(level)) for level in color)
+    return (
+        f"the skin is {cast} (red {red}, green {green}, blue {blue} of 255), and the avatar's will be; record the "
+        "video again in white light with the camera's white balance set on white paper, or correct the colours in "
+        "a video program"
+    )
+
+
+def _light_hint(levels: Float[np.ndarray, " t"]) -> str:
+    darkest, brightest = int(np.nanargmin(levels)), int(np.nanargmax(levels))
+    return (
+        f"the light on the face changes by a factor of {light_change(levels):.1f} (mean level {levels[darkest]:.0%} in "
+        f"frame {darkest}, {levels[brightest]:.0%} in frame {brightest}); training evens it out with a gain for each "
+        "frame, which is less good than steady light; record the video again with the camera's exposure and white "
+        "balance locked"
+    )
+
+
+def _tint_hint(tints: Float[np.ndarray, " t"]) -> str:
+    least, most = int(np.nanargmin(tints)), int(np.nanargmax(tints))
+    return (
+        f"the white balance drifts: the skin's blue is {tints[least]:.0%} of its red in frame {least}, and "
+        f"{tints[most]:.0%} in frame {most}; add --training.light changing to the training, which learns a gain for "
+        "each frame, or record the video again with the camera's white balance locked"
+    )
 
 
 def find_cast(color: Float[np.ndarray, " 3"]) -> str:
@@ -211,61 +225,72 @@ def find_cast(color: Float[np.ndarray, " 3"]) -> str:
     """
     red, green, blue = (float(level) for level in color)
     strongest = max(green, blue)
-    if strongest <= _MAX_CAST * red or max(red, strongest) - min(red, green, blue) < _MIN_COLOR * max(red, strongest):
+    # Channels that are nearly equal are those of black and white film, which has no cast.
+    if strongest <= _MAX_CAST * red or max(red, strongest) - min(red, green, blue) < 0.05 * max(red, strongest):
         return ""
     return "green" if green >= blue else "blue"
 
 
-def _hints(
-    dark: float | None,
-    white: float | None,
-    cast: str,
-    color: Float[np.ndarray, " 3"],
-    noise: float | None,
-    changing: Float[np.ndarray, " t"] | None,
-    drifting: Float[np.ndarray, " t"] | None,
-) -> list[str]:
-    """Return a line with a remedy for each fault.
+_RATE_TOLERANCE = 0.01  # relative difference up to which the measured frame rate is taken for the file's nominal one
+_RATE_STEADY_RATIO = 1.6
+"""Ratio to the median up to which times between frames count for the rate. It is above 1.5, which films at 24 frames a
+second have on a grid of 60: they alternate between two and three steps."""
 
-    The faults are a dark face's level, an over-exposed face's white part, a cast, the noise, and for each frame the
-    brightness where it changes and the ratio of blue to red where that drifts.
+_MAX_INTERVAL_RATIO = 1.5  # of the longest to the median time between frames from which a rate is called variable
+_PAUSE_SECONDS, _PAUSE_STEPS = 0.5, 2.5
+"""Time between two frames from which it is called a pause: in seconds, and as a multiple of the median, so that a
+dropped frame of a slow clip is none."""
+
+
+def pace_report(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, Any]:
+    """Return the time between frames for the report, and tell the user if it varies."""
+    if len(timestamps) < 3:
+        return {"frame_interval_ms": None, "variable_frame_rate": False}
+    intervals = 1000 * np.diff(timestamps)
+    least, usual, most = (round(float(value), 2) for value in (intervals.min(), np.median(intervals), intervals.max()))
+    is_variable = most > _MAX_INTERVAL_RATIO * usual or least * _MAX_INTERVAL_RATIO < usual
+    if is_variable:
+        say(f"{name}: frames {least:g} to {most:g} ms apart (variable rate); all are kept, each with its own time")
+    return {
+        "frame_interval_ms": {"least": least, "median": usual, "most": most},
+        "variable_frame_rate": is_variable,
+        **tell_pauses(name, timestamps),
+    }
+
+
+def is_pause(steps: Float[np.ndarray, " s"]) -> Bool[np.ndarray, " s"]:
+    """Tell which times between frames are pauses, in which the video has no frame for long."""
+    return steps > max(_PAUSE_SECONDS, _PAUSE_STEPS * float(np.median(steps)))
+
+
+def tell_pauses(name: str, timestamps: Float[np.ndarray, " t"]) -> dict[str, int]:
+    """Tell the user about pauses. Return their number for the report, or nothing if there is none."""
+    steps = np.diff(timestamps)
+    pauses = np.flatnonzero(is_pause(steps)) if len(steps) else []
+    if not len(pauses):
+        return {}
+    longest = pauses[int(np.argmax(steps[pauses]))]
+    which = "a pause" if len(pauses) == 1 else f"{len(pauses)} pauses, the longest"
+    say(
+        f"{name}: {which} of {steps[longest]:.1f} s without a frame, after {timestamps[longest]:.1f} s; the frame rate "
+        "is that of the other frames"
+    )
+    return {"pauses": len(pauses)}
+
+
+def frame_rate(timestamps: Float[np.ndarray, " t"], nominal: float) -> float:
+    """Return the file's nominal rate, unless its timestamps differ from it (variable rate, dropped frames, pauses).
+
+    Then it is the rate of the frames that are about as far apart as the median, so that pauses and dropped frames do
+    not count.
     """
-    hints = []
-    if dark is not None:
-        hints.append(
-            f"the face is dark (mean level {dark:.0%}); the avatar will be noisy; record the video again with more "
-            "light on the face"
-        )
-    if white is not None:
-        hints.append(
-            f"the face is over-exposed ({white:.0%} of it is white); white parts have no detail; record the video "
-            "again with less exposure"
-        )
-    if cast:
-        red, green, blue = (round(255 * float(level)) for level in color)
-        hints.append(
-            f"the skin is {cast} (red {red}, green {green}, blue {blue} of 255), and the avatar's will be; record the "
-            "video again in white light with the camera's white balance set on white paper, or correct the colours in "
-            "a video program"
-        )
-    if noise is not None:
-        hints.append(
-            f"the pictures are noisy (a deviation of {255 * noise:.1f} of 255 levels in the skin); fine detail will be "
-            "missing; record the video again with more light on the face, and with the camera's gain (ISO) lower"
-        )
-    if changing is not None:
-        darkest, brightest = int(np.nanargmin(changing)), int(np.nanargmax(changing))
-        hints.append(
-            f"the light on the face changes by a factor of {light_change(changing):.1f} (mean level "
-            f"{changing[darkest]:.0%} in frame {darkest}, {changing[brightest]:.0%} in frame {brightest}); training "
-            "evens it out with a gain for each frame, which is less good than steady light; record the video again "
-            "with the camera's exposure and white balance locked"
-        )
-    if drifting is not None:
-        least, most = int(np.nanargmin(drifting)), int(np.nanargmax(drifting))
-        hints.append(
-            f"the white balance drifts: the skin's blue is {drifting[least]:.0%} of its red in frame {least}, and "
-            f"{drifting[most]:.0%} in frame {most}; add --training.light changing to the training, which learns a gain "
-            "for each frame, or record the video again with the camera's white balance locked"
-        )
-    return hints
+    steps = np.diff(timestamps)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if usual <= 0:
+        return nominal
+    steady = (steps <= _RATE_STEADY_RATIO * usual) & (steps * _RATE_STEADY_RATIO >= usual)
+    if steady.all():
+        measured = float(len(steps) / timestamps[-1])
+    else:
+        measured = 1 / float(steps[steady].mean() if steady.any() else usual)
+    return nominal if abs(measured - nominal) <= _RATE_TOLERANCE * nominal else measured

@@ -8,9 +8,6 @@ from typing import Literal
 from mien.capture.person.backend import DetectorChoice
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
-from mien.media.choices import Deinterlace
-
-_MIN_SIZE = 32
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class CaptureSettings:
     person: int = 1
     """Whom to keep of a video that cuts between people: 1 is the person in most frames, 2 the next. 0 takes all for one
     person, and does not compare them with other videos of the workspace."""
-    deinterlace: Deinterlace = "auto"
+    deinterlace: Literal["auto", "always", "never"] = "auto"
     """Which frames of an interlaced video become progressive pictures, one for each frame. auto: those that are marked
     as interlaced. always: all, for a video that lost the mark. never: none, for one that was filmed progressively."""
     clean_plate: Path | None = None
@@ -59,34 +56,25 @@ class CaptureSettings:
 
     def check(self) -> None:
         """Raise a UserError for the first value that is not allowed."""
-        _require(self.size >= _MIN_SIZE, "size", self.size, f"too small; give {_MIN_SIZE} or more, better 512")
-        _require(self.size <= MAX_SIDE, "size", self.size, f"too large; give {MAX_SIDE} or less")
-        _require(_is_at_least(self.start, 0), "start", self.start, "give the seconds to skip, 0 or more")
-        later = self.end == 0 or _is_at_least(self.end, self.start) and self.end > self.start
-        _require(later, "end", self.end, f"give a time after --capture.start ({self.start:g}), or 0 for all")
-        _require(self.stream is None or self.stream >= 0, "stream", self.stream or 0, "give an index, 0 or more")
-        _require(self.stride >= 1, "stride", self.stride, "give 1 for every frame, 2 for every second one, ...")
-        _require(self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number")
-        _require(_is_at_least(self.fps, 0) and self.fps > 0, "fps", self.fps, "give frames per second, above 0")
-        _require(_is_at_least(self.shortest_part, 0), "shortest-part", self.shortest_part, "give seconds, 0 or more")
-        _require(
-            self.person >= 0, "person", self.person, "give 1 for the person in most frames, 2, 3, ..., or 0 for all"
-        )
+        later = self.end == 0 or (math.isfinite(self.end) and self.end > self.start)
+        for holds, option, value, remedy in (
+            (self.size >= 32, "size", self.size, "too small; give 32 or more, better 512"),
+            (self.size <= MAX_SIDE, "size", self.size, f"too large; give {MAX_SIDE} or less"),
+            (0 <= self.start < math.inf, "start", self.start, "give the seconds to skip, 0 or more"),
+            (later, "end", self.end, f"give a time after --capture.start ({self.start:g}), or 0 for all"),
+            (self.stream is None or self.stream >= 0, "stream", self.stream or 0, "give an index, 0 or more"),
+            (self.stride >= 1, "stride", self.stride, "give 1 for every frame, 2 for every second one, ..."),
+            (self.max_frames >= 0, "max-frames", self.max_frames, "give 0 for all frames, or a positive number"),
+            (0 < self.fps < math.inf, "fps", self.fps, "give frames per second, above 0"),
+            (0 <= self.shortest_part < math.inf, "shortest-part", self.shortest_part, "give seconds, 0 or more"),
+            (self.person >= 0, "person", self.person, "give 1 for the person in most frames, 2, 3, ..., or 0 for all"),
+        ):
+            if not holds:
+                raise UserError(f"--capture.{option} {value:g}: {remedy}")
         if self.mattes is not None and self.clean_plate is not None:
             raise UserError("--capture.mattes and --capture.clean-plate: give one of them; ready mattes need no plate")
-        for option, path in (
-            ("clean-plate", self.clean_plate),
-            ("mattes", self.mattes),
-            ("landmarks", self.landmarks),
-        ):
+        for option in ("clean_plate", "mattes", "landmarks"):
+            path: Path | None = getattr(self, option)
             if path is not None and not path.exists():
-                raise UserError(f"--capture.{option} {path}: no such file or folder; check the path")
-
-
-def _is_at_least(value: int | float, least: int | float) -> bool:
-    return math.isfinite(value) and value >= least
-
-
-def _require(holds: bool, option: str, value: int | float, remedy: str) -> None:
-    if not holds:
-        raise UserError(f"--capture.{option} {value:g}: {remedy}")
+                name = option.replace("_", "-")
+                raise UserError(f"--capture.{name} {path}: no such file or folder; check the path")

@@ -1,30 +1,42 @@
 """Write and read captures on disk: `capture.json`, `landmarks.safetensors`, `frames/`, `mattes/` and a `cache/`."""
 
 import hashlib
-from dataclasses import dataclass, fields
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
 
 from mien.camera import Camera
-from mien.capture.cache import map_frames, stamp_cache
+from mien.capture.cameras.calibration import is_file_name
 from mien.capture.capture import Capture
-from mien.capture.frame_files import CACHE, FRAMES, MATTES, REMEDY, STAGE, FrameLayout, FrameWriter
+from mien.capture.frame_files import (
+    CACHE,
+    FRAMES,
+    MATTES,
+    REMEDY,
+    STAGE,
+    FrameLayout,
+    FrameWriter,
+    map_frames,
+    stamp_cache,
+)
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.quality import FrameQuality
 from mien.disk.files import cannot_write, expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
-from mien.disk.inside import check_tree, is_one_line, is_plain_name, remove_tree
-from mien.disk.limits import MAX_NUMBER, camera_fault, checked_side
+from mien.disk.inside import check_tree, is_one_line, remove_tree
+from mien.disk.limits import camera_fault, checked_side, checked_whole, is_moderate
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
-from mien.machine.progress import progress_bar
+from mien.machine.progress import progress_bar, say
+from mien.machine.terminal import counted
 
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
 _OWN_NAMES = frozenset({JSON_NAME, ARRAYS_NAME, REPORT_NAME, FRAMES, MATTES, CACHE})
+_QUALITY = ("sharpness", "brightness", "clipped")
+"""Arrays that are there if the faces were measured."""
 _ARRAYS = {
     "timestamps": ("t", np.float64),
     "landmarks": ("tcl2", np.float32),
@@ -32,41 +44,16 @@ _ARRAYS = {
     "principal_point": ("c2", np.float64),
     "frame_digests": ("tc", np.uint64),
     "matte_digests": ("tc", np.uint64),
+    **dict.fromkeys(_QUALITY, ("tc", np.float32)),
+    "K": ("c33", np.float64),
+    "viewmat": ("c44", np.float64),
 }
-"""Axes and type of every array in the safetensors file."""
-_CALIBRATION_ARRAYS = {"K": ("c33", np.float64), "viewmat": ("c44", np.float64)}
-"""Additional arrays if the cameras are calibrated."""
-_QUALITY_ARRAYS = {"sharpness": ("tc", np.float32), "brightness": ("tc", np.float32), "clipped": ("tc", np.float32)}
-"""Additional arrays if the faces were measured."""
-_MIN_FPS, _MAX_FPS = 1e-3, 1e5
-"""Range of frame rates, in frames per second."""
-_MAX_SECONDS = 1e7
-"""Longest time from the first frame to the last, in seconds."""
-_OPTIONAL_ARRAYS = (_CALIBRATION_ARRAYS, _QUALITY_ARRAYS)
-
-
-@dataclass(frozen=True, eq=False)
-class CaptureData:
-    """A capture without its pictures. Its fields are those of `Capture` with the same names."""
-
-    name: str
-    camera_ids: tuple[str, ...]
-    fps: float
-    timestamps: Float[np.ndarray, " t"]
-    landmarks: Float[np.ndarray, "t c l 2"]
-    valid: Bool[np.ndarray, "t c"]
-    principal_point: Float[np.ndarray, "c 2"]
-    source: dict[str, Any]
-    calibration: tuple[Camera, ...] | None = None
-    quality: FrameQuality | None = None
+"""Axes and type of every array in the safetensors file. The last two are there if the cameras are calibrated."""
+_MAX_SECONDS = 1e7  # longest time from the first frame to the last, in seconds
 
 
 def write_capture(path: Path, capture: Capture) -> str:
-    """Write a capture to a folder, atomically, and return its hash. A capture that is there already is replaced.
-
-    Raises:
-        UserError: the folder holds something else, or cannot be written.
-    """
+    """Write a capture to a folder, atomically, and return its hash. A capture that is there already is replaced."""
     partial = partial_folder(path)
     try:
         check_replaceable(path)
@@ -78,20 +65,13 @@ def write_capture(path: Path, capture: Capture) -> str:
                 writer.submit(timestep, lambda images=images, mattes=mattes: (images, mattes))
                 advance()
             writer.flush()
-        data = CaptureData(**{one.name: getattr(capture, one.name) for one in fields(CaptureData)})
-        return finish_capture(layout, path, data, writer.digests)
+        return finish_capture(layout, path, capture, writer.digests)
     except OSError as error:
         raise cannot_write(path, error) from None
 
 
 def read_capture(path: Path) -> Capture:
-    """Read a capture.
-
-    Its images and mattes are memory maps of the decoded cache. A stale cache is rebuilt first.
-
-    Raises:
-        UserError: the folder is missing, damaged, incomplete, of another version, or being written, or holds a link.
-    """
+    """Read a capture. Images and mattes are memory maps of the decoded cache, which is rebuilt if it is stale."""
     return read_beside_writers(lambda: _read_capture(path), [path], [path, path.parent])
 
 
@@ -99,15 +79,47 @@ def _read_capture(path: Path) -> Capture:
     if not path.is_dir():
         raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
     check_tree(path)
-    content = read_json(path / JSON_NAME, FORMAT, VERSION, STAGE)
-    layout, data, digests = _checked(path, content, read_arrays(path / ARRAYS_NAME, STAGE))
-    if content.get("capture_hash") != _hash(data, layout, digests):
+    content, arrays = read_json(path / JSON_NAME, FORMAT, VERSION, STAGE), read_arrays(path / ARRAYS_NAME, STAGE)
+    with expect_whole(path / JSON_NAME, REMEDY):
+        _check(content, arrays)
+        camera_ids = tuple(content["camera_ids"])
+        width, height = checked_side(content["width"]), checked_side(content["height"])
+        layout = FrameLayout(path, camera_ids, content["timesteps"], height, width)
+        fps = float(content["fps"])
+        belongs = content["capture_hash"] == _hash(layout, fps, arrays)
+        calibration = _calibration(arrays, width, height)
+        quality = FrameQuality(*(arrays[name] for name in _QUALITY)) if "sharpness" in arrays else None
+    if not belongs:
         raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {REMEDY}")
+    digests = {FRAMES: arrays["frame_digests"], MATTES: arrays["matte_digests"]}
     images, mattes = map_frames(layout, content["capture_hash"], digests)
     if read_capture_hash(path) != content["capture_hash"]:
         # The folder was replaced while it was mapped, so the maps may be of two captures.
         raise UserError(f"{path}: was replaced while it was read; run the same command again")
-    return Capture(images=images, mattes=mattes, **vars(data))
+    return Capture(
+        name=content["name"],
+        camera_ids=camera_ids,
+        fps=fps,
+        timestamps=arrays["timestamps"],
+        images=images,
+        mattes=mattes,
+        landmarks=arrays["landmarks"],
+        valid=arrays["valid"],
+        principal_point=arrays["principal_point"],
+        source=content["source"],
+        calibration=calibration,
+        quality=quality,
+    )
+
+
+def _calibration(arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[Camera, ...] | None:
+    if "K" not in arrays:
+        return None
+    pairs = list(zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True))
+    for K, viewmat in pairs:
+        if fault := camera_fault(K, viewmat, width, height):
+            raise ValueError(f"a camera is not valid: {fault}")
+    return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
 
 
 def read_capture_hash(path: Path) -> str:
@@ -116,10 +128,7 @@ def read_capture_hash(path: Path) -> str:
 
 
 def partial_folder(path: Path) -> Path:
-    """Return the folder for an unfinished capture.
-
-    It is beside the final place, so that a rename finishes the capture.
-    """
+    """Return the folder for an unfinished capture, beside the final place, so that a rename finishes it."""
     return path.parent / f".{path.name}.partial"
 
 
@@ -137,141 +146,108 @@ def check_replaceable(path: Path) -> None:
 def finish_capture(
     layout: FrameLayout,
     path: Path,
-    data: CaptureData,
+    capture: Capture,
     digests: dict[str, np.ndarray],
     report: dict[str, Any] | None = None,
 ) -> str:
-    """Write the files beside the frames, rename the finished folder to `path` and return the capture's hash."""
+    """Write the files beside the frames, which are in the layout's folder, rename it to `path` and return the hash."""
     folder = layout.folder
-    capture_hash = _hash(data, layout, digests)
-    write_arrays(folder / ARRAYS_NAME, _arrays(data, digests))
+    arrays = _arrays(capture, digests)
+    capture_hash = _hash(layout, capture.fps, arrays)
+    write_arrays(folder / ARRAYS_NAME, arrays)
     if report is not None:
         write_json(folder / REPORT_NAME, "mien.capture_report", 1, report)
     stamp_cache(layout, capture_hash)
     content = {
-        "name": data.name,
-        "camera_ids": list(data.camera_ids),
-        "fps": data.fps,
+        "name": capture.name,
+        "camera_ids": list(capture.camera_ids),
+        "fps": capture.fps,
         "timesteps": layout.timesteps,
         "width": layout.width,
         "height": layout.height,
         "capture_hash": capture_hash,
-        "source": data.source,
+        "source": capture.source,
     }
     write_json(folder / JSON_NAME, FORMAT, VERSION, content)
     replace_folder(path, folder)
     return capture_hash
 
 
-def _arrays(data: CaptureData, digests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _arrays(capture: Capture, digests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     arrays = {
-        "timestamps": data.timestamps,
-        "landmarks": data.landmarks,
-        "valid": data.valid,
-        "principal_point": data.principal_point,
+        "timestamps": capture.timestamps,
+        "landmarks": capture.landmarks,
+        "valid": capture.valid,
+        "principal_point": capture.principal_point,
         "frame_digests": digests[FRAMES],
         "matte_digests": digests[MATTES],
     }
-    if data.calibration is not None:
-        arrays["K"] = np.stack([camera.K.numpy() for camera in data.calibration])
-        arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in data.calibration])
-    if data.quality is not None:
-        arrays |= {name: getattr(data.quality, name) for name in _QUALITY_ARRAYS}
-    dtypes = _ARRAYS | _CALIBRATION_ARRAYS | _QUALITY_ARRAYS
-    return {name: array.astype(dtypes[name][1]) for name, array in arrays.items()}
+    if capture.calibration is not None:
+        arrays["K"] = np.stack([camera.K.numpy() for camera in capture.calibration])
+        arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in capture.calibration])
+    if capture.quality is not None:
+        arrays |= vars(capture.quality)
+    return {name: array.astype(_ARRAYS[name][1]) for name, array in arrays.items()}
 
 
-def _hash(data: CaptureData, layout: FrameLayout, digests: dict[str, np.ndarray]) -> str:
-    digest = hashlib.sha256(repr((data.camera_ids, data.fps, layout.height, layout.width)).encode())
-    for name, array in sorted(_arrays(data, digests).items()):
+def _hash(layout: FrameLayout, fps: float, arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(repr((layout.camera_ids, fps, layout.height, layout.width)).encode())
+    for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.shape};".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
-def _checked(
-    path: Path, content: dict[str, Any], arrays: dict[str, np.ndarray]
-) -> tuple[FrameLayout, CaptureData, dict[str, np.ndarray]]:
-    """Return everything but the pictures, after checks of every field's type, range and size."""
-    camera_ids: Any = content.get("camera_ids")
-    name, fps, source = content.get("name"), content.get("fps"), content.get("source")
-    with expect_whole(path / JSON_NAME, REMEDY):
-        timesteps, (height, width) = content["timesteps"], (checked_side(content[key]) for key in ("height", "width"))
-    if not (
-        (isinstance(camera_ids, list) and camera_ids and all(map(is_file_name, camera_ids)))
-        and (len(set(camera_ids)) == len(camera_ids) and _is_count(timesteps))
-        and (isinstance(fps, int | float) and _MIN_FPS <= fps <= _MAX_FPS)
-        and (isinstance(name, str) and is_one_line(name) and isinstance(source, dict))
-    ):
-        raise UserError(f"{path / JSON_NAME}: has missing or wrong entries; {REMEDY}")
-    _check_arrays(path / ARRAYS_NAME, arrays, timesteps, len(camera_ids))
-    _check_numbers(path / ARRAYS_NAME, arrays)
-    data = CaptureData(
-        name=name,
-        camera_ids=tuple(camera_ids),
-        fps=float(fps),
-        timestamps=arrays["timestamps"],
-        landmarks=arrays["landmarks"],
-        valid=arrays["valid"],
-        principal_point=arrays["principal_point"],
-        source=source,
-        calibration=_calibration(path / ARRAYS_NAME, arrays, width, height),
-        quality=FrameQuality(*(arrays[name] for name in _QUALITY_ARRAYS)) if "sharpness" in arrays else None,
-    )
-    layout = FrameLayout(path, data.camera_ids, timesteps, height, width)
-    return layout, data, {FRAMES: arrays["frame_digests"], MATTES: arrays["matte_digests"]}
-
-
-def _calibration(path: Path, arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[Camera, ...] | None:
-    if "K" not in arrays:
-        return None
-    for K, viewmat in zip(arrays["K"], arrays["viewmat"], strict=True):
-        fault = camera_fault(K, viewmat, width, height)
-        if fault is not None:
-            raise UserError(f"{path}: a camera is not valid ({fault}); {REMEDY}")
-    pairs = zip(arrays["K"].astype(np.float32), arrays["viewmat"].astype(np.float32), strict=True)
-    return tuple(Camera(torch.from_numpy(K), torch.from_numpy(viewmat), width, height) for K, viewmat in pairs)
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def is_file_name(name: object) -> bool:
-    """Whether a camera's name can be the name of a folder on any system."""
-    return is_plain_name(name) and not set(str(name)) & set(':*?"<>|')
-
-
-def _check_numbers(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Check that times do not decrease, and that no number is infinite or far outside of any picture.
-
-    Landmarks may be NaN only where there is no face.
-    """
-    times, valid = arrays["timestamps"], arrays["valid"]
-    with np.errstate(invalid="ignore"):
-        near = {
-            "timestamps": np.isfinite(times).all()
-            and bool((np.diff(times) >= 0).all())
-            and np.ptp(times) < _MAX_SECONDS,
-            "landmarks": not np.isnan(arrays["landmarks"][valid]).any(),
-            "principal_point": np.isfinite(arrays["principal_point"]).all(),
-        }
-        for name in ("landmarks", "principal_point"):
-            near[name] = near[name] and not (np.abs(arrays[name]) > MAX_NUMBER).any()
-        for name in arrays.keys() & _QUALITY_ARRAYS.keys():
-            near[name] = not np.isinf(arrays[name]).any()
-    for name, sound in near.items():
-        if not sound:
-            raise UserError(f"{path}: {name} holds impossible numbers; {REMEDY}")
-
-
-def _check_arrays(path: Path, arrays: dict[str, np.ndarray], timesteps: int, cameras: int) -> None:
-    sizes = {"t": timesteps, "c": cameras, "l": LANDMARKS, "2": 2, "3": 3, "4": 4}
-    wanted = dict(_ARRAYS)
-    for optional in _OPTIONAL_ARRAYS:
-        wanted |= optional if arrays.keys() & optional.keys() else {}
-    for name, (axes, dtype) in wanted.items():
+def _check(content: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Check what may come from a stranger: names of folders, sizes, and numbers that would overflow later."""
+    ids, times, valid = content["camera_ids"], arrays["timestamps"], arrays["valid"]
+    if not (ids and all(map(is_file_name, ids)) and len(set(ids)) == len(ids)):
+        raise ValueError("names of cameras that no folders can have")
+    if not (1e-3 <= content["fps"] <= 1e5 and is_one_line(content["name"]) and isinstance(content["source"], dict)):
+        raise ValueError("frame rate, name or source that no capture has")
+    timesteps = checked_whole(content["timesteps"], 1, 1 << 40)
+    sizes = {"t": timesteps, "c": len(ids), "l": LANDMARKS, "2": 2, "3": 3, "4": 4}
+    for name, array in arrays.items():
+        axes, dtype = _ARRAYS[name]
         expected = tuple(sizes[axis] for axis in axes)
-        if name not in arrays or arrays[name].shape != expected or arrays[name].dtype != dtype:
-            found = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "missing"
-            raise UserError(f"{path}: {name} is {found}, expected {np.dtype(dtype)} {expected}; {REMEDY}")
+        if array.shape != expected or array.dtype != dtype:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {expected}")
+    # Landmarks may be NaN only where there is no face, and so may the quality.
+    landmarks = arrays["landmarks"]
+    numbers = (times, arrays["principal_point"], landmarks[valid], landmarks[~np.isnan(landmarks)])
+    if not all(map(is_moderate, numbers)) or (np.diff(times) < 0).any() or np.ptp(times) > _MAX_SECONDS:
+        raise ValueError("impossible times, landmarks or principal points")
+    if any(np.isinf(arrays[name]).any() for name in _QUALITY if name in arrays):
+        raise ValueError("impossible figures of quality")
+
+
+_PNG_SHARE = 0.5
+"""Size of lossless PNGs relative to their pixels. Footage takes 0.2 to 0.5 of them, mattes almost nothing."""
+
+
+def capture_bytes(layout: FrameLayout) -> int:
+    """Estimate the room that a capture takes on disk, in bytes: the decoded pixels and the PNGs."""
+    frames, mattes = layout.raw_size(FRAMES), layout.raw_size(MATTES)
+    return frames + mattes + round(_PNG_SHARE * frames)
+
+
+def check_room(layout: FrameLayout, name: str, out: Path) -> None:
+    """Say how much room a capture takes, before its pictures are written. Files of an interrupted run count as room."""
+    cameras, size = len(layout.camera_ids), f"{layout.width}x{layout.height}"
+    what = f"{counted(layout.timesteps, 'frame')} of {size}" + (f" by {cameras} cameras" if cameras > 1 else "")
+    needed = capture_bytes(layout)
+    # Files that are there already count by their blocks: raw files may have holes.
+    used = (path.stat().st_blocks for path in layout.folder.rglob("*") if path.is_file() and not path.is_symlink())
+    free = shutil.disk_usage(layout.folder).free + 512 * sum(used)
+    if free < needed:
+        if not any(entry.is_dir() for entry in layout.folder.iterdir()):
+            remove_tree(layout.folder)  # no picture is in it
+        raise UserError(
+            f"{out}: {what} take about {_text(needed)} on disk, and there are {_text(free)} left; free disk space, "
+            "choose another --out, or take less (--capture.max-frames, --capture.stride, --capture.size)"
+        )
+    say(f"{name}: {what} take about {_text(needed)} on disk")
+
+
+def _text(count: int) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{max(1, round(count / 1e6))} MB"

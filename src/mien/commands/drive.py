@@ -12,7 +12,7 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
-from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.driver import name_driver, name_neutral
 from mien.pipeline.names import check_avatar, check_port, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
 
@@ -74,8 +74,8 @@ class Film(_Neutral, _Film, _Drive):
         open_workspace(self.workspace).pick_run(self.run_name)
         # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
-        check_driver(Path(self.by), self.sequence, self.fps, self.capture)
-        check_neutral(self.neutral)
+        name_driver(Path(self.by), self.sequence, self.fps, self.capture)
+        name_neutral(self.neutral)
 
     def run(self) -> None:
         """Track the driver if necessary, then pose and render every timestep."""
@@ -100,8 +100,8 @@ class Show(_Neutral, _Drive):
         open_workspace(self.workspace).pick_run(self.run_name)
         check_port(self.port)
         check_viewer()
-        check_driver(Path(self.by), None, None, self.capture)
-        check_neutral(self.neutral)
+        name_driver(Path(self.by), None, None, self.capture)
+        name_neutral(self.neutral)
 
     def run(self) -> None:
         """Show the avatar until Ctrl-C."""
@@ -135,7 +135,7 @@ class Follow(_Film, _Drive):
 
     def run(self) -> None:
         """Follow until Ctrl-C, or until the file of a camera ends."""
-        from mien.driving.live.follower import FollowOptions
+        from mien.driving.follower import FollowOptions
         from mien.pipeline.follow import CameraOptions, run_following_stage
         from mien.pipeline.view import Place
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.errors import UserError
-from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.driver import name_driver, name_neutral
 from mien.pipeline.names import check_avatar, check_port, check_viewer
 
 _LOOPBACK = "127.0.0.1"
@@ -43,8 +43,8 @@ class Command:
             raise UserError(f"--follow: needs a .mien file, and {self.avatar} is a workspace; leave --follow out")
         check_port(self.port)
         if self.play is not None:
-            check_driver(Path(self.play), None)
-        check_neutral(self.neutral)
+            name_driver(Path(self.play), None)
+        name_neutral(self.neutral)
         check_viewer()
 
     def run(self) -> None:

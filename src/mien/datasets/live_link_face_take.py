@@ -63,7 +63,7 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         check_file_inside(path, table)
         with readable(table, "csv", REMEDY):
             files["driving.csv"] = read_bytes(table, 256 << 20)
-        from mien.driving.sources.live_link_face import read_live_link_face
+        from mien.driving.live_link_face import read_live_link_face
 
         read_live_link_face(table)  # a damaged one is refused before the video is processed
     yield Footage(path.resolve().name, (video,), files=files)

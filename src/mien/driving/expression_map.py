@@ -5,7 +5,8 @@ anybody's weights: both neutral faces are registered by their landmarks, and eac
 other's motions in the least-squares sense, within their bounds. Eyes and neck turn alike in all models.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -26,63 +27,48 @@ _TRANSFER_JAW_STEP = 0.2  # angle in radians over which a jaw's motion is taken 
 _TRANSFER_SWEEPS = 40  # rounds of the bounded fit
 
 _MARKS = "mediapipe"
-_FACE_MARKS = 468
-"""Number of landmarks before those of the irises, which turn with the eyes."""
 _JAW = "jaw"
-_BATCH = 16
-"""Number of motions that are posed at once, which bounds the memory."""
-_LEAST_COMMON = 30
-"""Least number of ARKit's names that two models need in common to share them by name."""
+_BATCH = 16  # motions that are posed at once, which bounds the memory
 
 
-@dataclass(frozen=True, eq=False)
-class ExpressionMap:
-    """The map from a source model's motions (expressions, then a free jaw's axis-angle) to a target's."""
+def fit_expression_map(source: FaceModel, target: FaceModel) -> Callable[[FaceParams], FaceParams]:
+    """Fit the map between two face models.
 
-    source: FaceModel
-    target: FaceModel
-    toward: Float[Tensor, "s t"]
-    """What each motion of the source asks of each motion of the target: the right sides of the normal equations, or
-    the solution itself if `normal` is None."""
-    normal: Float[Tensor, "t t"] | None
-    """Matrix of the normal equations of the target's motions. None if names are shared."""
+    It returns the target's mean person with the motions (expressions, then a free jaw's axis-angle) and head poses of
+    the source's, within its bounds.
+    """
+    toward, normal = _normal_equations(source, target)
+    lower, upper = _bounds(target)
 
-    def __call__(self, face: FaceParams) -> FaceParams:
-        """Return the target's mean person with the same motions and head poses, within the bounds of its expressions.
-
-        Args:
-            face: Face parameters of the source model.
-        """
-        given = _motions(self.source, face)
-        wanted = given.double() @ self.toward
-        lower, upper = _bounds(self.target)
-        if self.normal is not None:
-            wanted = _within_bounds(self.normal, wanted, lower, upper)
+    def transferred(face: FaceParams) -> FaceParams:
+        wanted = _motions(source, face).double() @ toward
+        if normal is not None:
+            wanted = _within_bounds(normal, wanted, lower, upper)
         found = wanted.clamp(lower, upper).to(face.expression)
-        rest, e = self.target.neutral(len(face)), len(self.target.expression_names)
+        rest, e = target.neutral(len(face)), len(target.expression_names)
         joints = rest.joints.clone()
-        for row, name in enumerate(self.target.free_joint_names):
+        for row, name in enumerate(target.free_joint_names):
             if name == _JAW:
                 joints[:, row] = found[:, e:]
-            elif name in self.source.free_joint_names:
-                joints[:, row] = face.joints[:, self.source.free_joint_names.index(name)]
-        return replace(
-            rest,
-            expression=found[:, :e],
-            joints=joints,
-            head_rotation=face.head_rotation,
-            head_translation=face.head_translation,
-        )
+            elif name in source.free_joint_names:
+                joints[:, row] = face.joints[:, source.free_joint_names.index(name)]
+        pose = {"head_rotation": face.head_rotation, "head_translation": face.head_translation}
+        return replace(rest, expression=found[:, :e], joints=joints, **pose)
+
+    return transferred
 
 
-def fit_expression_map(source: FaceModel, target: FaceModel) -> ExpressionMap:
-    """Fit the map between two face models."""
+def _normal_equations(source: FaceModel, target: FaceModel) -> tuple[Float[Tensor, "s t"], Float[Tensor, "t t"] | None]:
+    """What each motion of the source asks of each of the target, and the matrix of the target's motions.
+
+    They are the two sides of the normal equations. If names are shared, there is no matrix, and the first is the map.
+    """
     shared = set(source.expression_names) & set(target.expression_names) & set(ARKIT_NAMES)
-    if len(shared) >= _LEAST_COMMON and not any(_JAW in model.free_joint_names for model in (source, target)):
+    if len(shared) >= 30 and not any(_JAW in model.free_joint_names for model in (source, target)):
         by_name = torch.zeros(len(source.expression_names), len(target.expression_names), dtype=torch.float64)
         for name in shared:
             by_name[source.expression_names.index(name), target.expression_names.index(name)] = 1
-        return ExpressionMap(source, target, by_name, None)
+        return by_name, None
     for model in (source, target):
         if _MARKS not in model.landmarks:
             raise UserError(
@@ -92,9 +78,14 @@ def fit_expression_map(source: FaceModel, target: FaceModel) -> ExpressionMap:
     (rest, theirs), (our_rest, ours) = _displacements(_at_landmarks(source)), _displacements(_at_landmarks(target))
     theirs = (theirs @ _registration(rest, our_rest).T).flatten(1)
     ours = ours.flatten(1)
-    noise = _TRANSFER_NOISE
-    normal = ours @ ours.T / noise**2 + torch.diag(_precisions(target))
-    return ExpressionMap(source, target, theirs @ ours.T / noise**2, normal)
+    # The inverse variances of the motions, by which the fit prefers usual faces.
+    e, sigmas = len(target.expression_names), target.expression_sigmas
+    spread = torch.full((e,), _TRANSFER_SPREAD) if sigmas is None else sigmas
+    if _JAW in target.free_joint_names:
+        spread = torch.cat([spread, torch.full((3,), _TRANSFER_JAW_SPREAD)])
+    precisions = spread.double().clamp_min(1e-6).square().reciprocal()
+    normal = ours @ ours.T / _TRANSFER_NOISE**2 + torch.diag(precisions)
+    return theirs @ ours.T / _TRANSFER_NOISE**2, normal
 
 
 def _motions(model: FaceModel, face: FaceParams) -> Float[Tensor, "b s"]:
@@ -110,18 +101,9 @@ def _bounds(model: FaceModel) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]
     return bounds[:, 0], bounds[:, 1]
 
 
-def _precisions(model: FaceModel) -> Float[Tensor, " t"]:
-    """Inverse variances of the motions, by which the fit prefers usual faces."""
-    e, sigmas = len(model.expression_names), model.expression_sigmas
-    spread = torch.full((e,), _TRANSFER_SPREAD) if sigmas is None else sigmas
-    if _JAW in model.free_joint_names:
-        spread = torch.cat([spread, torch.full((3,), _TRANSFER_JAW_SPREAD)])
-    return spread.double().clamp_min(1e-6).square().reciprocal()
-
-
 def _marks(model: FaceModel, face: FaceParams) -> Float[Tensor, "b l 3"]:
-    vertices = model.head_vertices_reference(face)
-    return model.landmark_positions(vertices, _MARKS)[:, :_FACE_MARKS].double()
+    # The landmarks of the irises, which are the last, turn with the eyes.
+    return model.landmark_positions(model.head_vertices_reference(face), _MARKS)[:, :468].double()
 
 
 def _at_landmarks(model: FaceModel) -> FaceModel:
@@ -151,16 +133,12 @@ def _displacements(model: FaceModel) -> tuple[Float[Tensor, "l 3"], Float[Tensor
     count = e + 3 * has_jaw
     rest = _marks(model, model.neutral())
     found = []
-    for start in range(0, count, _BATCH):
-        end = min(start + _BATCH, count)
-        face = model.neutral(end - start)
-        expression, joints = face.expression.clone(), face.joints.clone()
-        for row, motion in enumerate(range(start, end)):
-            if motion < e:
-                expression[row, motion] = 1
-            else:
-                joints[row, model.free_joint_names.index(_JAW), motion - e] = _TRANSFER_JAW_STEP
-        found.append(_marks(model, replace(face, expression=expression, joints=joints)) - rest)
+    for motions in torch.eye(count).split(_BATCH):
+        face = model.neutral(len(motions))
+        joints = face.joints.clone()
+        if has_jaw:
+            joints[:, model.free_joint_names.index(_JAW)] += _TRANSFER_JAW_STEP * motions[:, e:]
+        found.append(_marks(model, replace(face, expression=face.expression + motions[:, :e], joints=joints)) - rest)
     moved = torch.cat(found)
     moved[e:] /= _TRANSFER_JAW_STEP
     return rest[0], moved

@@ -24,20 +24,15 @@ ARKIT_NAMES = (
     "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "cheekPuff", "cheekSquintLeft",
     "cheekSquintRight", "noseSneerLeft", "noseSneerRight", "tongueOut",
 )  # fmt: skip
-"""ARKit's 52 blend shapes, in the order of Live Link Face's columns."""
+"""ARKit's 52 blend shapes, in the order of Live Link Face's columns. Left and right are the performer's."""
+PAIRS = tuple((name, name[:-4] + "Right") for name in ARKIT_NAMES if name.endswith("Left"))
+"""All directional coefficients, as pairs of left and right."""
 
-MAX_GAP_SECONDS = 60.0
-"""Longest gap between two moments, in seconds, that is interpolated. A longer gap means another recording."""
-MAX_MOMENTS = 500_000
-"""Largest number of moments in a recording: about two hours at 60 per second."""
-MAX_FILE_BYTES = 128 << 20
-"""Largest recording that is read, in bytes. An hour of Live Link Face has about this size."""
-_SLOWEST = 5.0
-"""Least number of moments a second of a recording of a face."""
-_SHORTEST, _LONGEST = 1 / 500, 3.0
-"""Bounds of the median time between two moments, in seconds. Beyond them, the times have another unit."""
-_MAX_SHOWN = 80
-"""Largest number of characters of a value that a message shows."""
+MAX_GAP_SECONDS = 60.0  # longest gap between two moments that is interpolated. A longer one means another recording
+MAX_MOMENTS = 500_000  # in a recording: about two hours at 60 per second
+MAX_FILE_BYTES = 128 << 20  # largest recording that is read. An hour of Live Link Face has about this size
+_SLOWEST = 5.0  # least number of moments a second of a recording of a face
+_SHORTEST, _LONGEST = 1 / 500, 3.0  # seconds between two moments. A median beyond them means another unit
 MIN_COEFFICIENT, MAX_COEFFICIENT = -0.5, 1.5
 """Bounds of a coefficient. They go from 0 to 1, and a little beyond in programs that calibrate or exaggerate."""
 
@@ -76,13 +71,10 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
     return eyes
 
 
-def resample_evenly(
+def _resample_evenly(
     seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]
 ) -> tuple[float, Float[np.ndarray, "t c"]]:
-    """Return frames per second, and rows at evenly spaced times.
-
-    Rows that are even already stay; others are interpolated linearly. `seconds` must increase strictly.
-    """
+    """Return frames per second, and rows at evenly spaced times, interpolated linearly unless they are even already."""
     if len(rows) < 2:
         return 30.0, rows
     step = float(np.median(np.diff(seconds)))
@@ -116,20 +108,16 @@ def evenly_timed(
 ) -> tuple[float, Float[np.ndarray, "t c"], int, tuple[str, ...]]:
     """Return frames per second, rows at evenly spaced times, the number of rows without a face, and lines for the user.
 
-    Rows that repeat a time are left out. Rows without a face repeat the row before.
-
-    Args:
-        path: The file.
-        times: What it calls its times.
-        seconds: The time of each row.
-        rows: The rows.
-        found: Whether each row has a face. At least one has.
+    Rows that repeat a time are left out. Rows without a face (not `found`) repeat the last one before them, or at the
+    start the first one with a face.
     """
-    kept, notes = without_repeats(seconds, times)
+    kept, notes = _without_repeats(seconds, times)
     if times.units is not None:
         _check_unit(path, times.name, times.units, seconds[kept])
     check_times(seconds[kept], lambda index: times.where(int(kept[index])))
-    fps, even = resample_evenly(seconds[kept], repeat_lost(rows, found)[kept])
+    last = np.maximum.accumulate(np.where(found, np.arange(len(rows)), -1))
+    filled = rows[np.where(last < 0, int(np.argmax(found)), last)]
+    fps, even = _resample_evenly(seconds[kept], filled[kept])
     if len(kept) > 1 and fps < _SLOWEST:
         line = (
             f"{path}: has {fps:.2g} rows a second, and recordings of faces have at least {_SLOWEST:g}; {times.faster}"
@@ -159,17 +147,12 @@ def out_of_range(value: float | int) -> str:
 
 
 def shorten(text: str) -> str:
-    """The text as messages show it, cut to `_MAX_SHOWN` characters."""
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+    """The text as messages show it, cut to 80 characters."""
+    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def open_recording(path: Path) -> IO[bytes]:
-    """Open a recording for reading. One that is too large for the memory, or that would never end, is refused.
-
-    Raises:
-        UserError: The file has more than `MAX_FILE_BYTES` bytes, or is a pipe, a device or a folder.
-        OSError: The file is missing.
-    """
+    """Open a recording for reading. One that is too large, or that would never end, is refused."""
     try:
         file = open_ordinary(path)
     except NotOrdinaryError:
@@ -181,12 +164,7 @@ def open_recording(path: Path) -> IO[bytes]:
 
 
 def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -> None:
-    """Refuse times for which `resample_evenly` would make up too many moments.
-
-    Args:
-        seconds: The times, which increase strictly.
-        where: Returns the name of a row's place in its file.
-    """
+    """Refuse increasing times between which too many moments would be interpolated. `where` names a row's place."""
     steps = np.diff(seconds)
     longest = int(np.argmax(steps)) if len(steps) else 0
     if len(steps) and steps[longest] > MAX_GAP_SECONDS:
@@ -202,12 +180,8 @@ def check_times(seconds: Float[np.ndarray, " r"], where: Callable[[int], str]) -
         )
 
 
-def without_repeats(seconds: Float[np.ndarray, " r"], times: Times) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Find the rows whose time comes after all before. Rows that repeat a time are left out.
-
-    Returns:
-        the indices of these rows, and a line for the user if others are left out.
-    """
+def _without_repeats(seconds: Float[np.ndarray, " r"], times: Times) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the indices of rows whose time comes after all before, and a line for the user on those left out."""
     latest = np.maximum.accumulate(seconds)
     late = np.concatenate([[False], seconds[1:] <= latest[:-1]])
     back = np.concatenate([[False], seconds[1:] < latest[:-1] - times.slack])
@@ -219,9 +193,3 @@ def without_repeats(seconds: Float[np.ndarray, " r"], times: Times) -> tuple[np.
     count = int(late.sum())
     line = f"{times.where(int(np.argmax(late)))}: has the time of a row before it and is left out; {count} in all"
     return np.flatnonzero(~late), (line,) if count else ()
-
-
-def repeat_lost(rows: Float[np.ndarray, "r c"], found: np.ndarray) -> Float[np.ndarray, "r c"]:
-    """The rows, with each row without a face replaced by the last one before it (at the start, by the first one)."""
-    last = np.maximum.accumulate(np.where(found, np.arange(len(rows)), -1))
-    return rows[np.where(last < 0, int(np.argmax(found)), last)]

@@ -33,7 +33,6 @@ _REST_JAW = (0.12, 0.24)  # the same for a jaw that is a joint, in radians
 _REST_SIGMAS_OF_ONE = 5.0
 """Standard deviations of a face model's coefficient that count as 1 of ARKit, so that the limits are 1.5 and 3."""
 
-Limits = tuple[float, float]
 _OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 
@@ -58,12 +57,9 @@ def rest_before(calm: FaceParams, model: FaceModel, cameras: tuple[Camera, ...])
 
 
 def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | None = None) -> AtRest:
-    """The face at rest of a person with these calm frames.
+    """The face at rest of a person with these calm frames (one timestep, see `neutral_of`).
 
-    Args:
-        calm: One timestep, see `neutral_of`.
-        model: The face model, whose neutral has only zeros.
-        ahead: R_world_head of a head that looks at the camera. The identity if None.
+    `ahead` is R_world_head of a head that looks at the camera; the identity if None.
     """
     moved: list[str] = []
     ahead = torch.eye(3).to(calm.head_rotation) if ahead is None else ahead.to(calm.head_rotation)
@@ -80,14 +76,13 @@ def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | No
     if head < 1:
         moved.append(f"the head {_degrees(away[0].norm())} degrees to the side")
         turn = axis_angle_from_matrix(ahead @ matrix_from_axis_angle(head * away))
-    for index, name in enumerate(model.free_joint_names):
-        if "eye" not in name.lower():
-            limits = _REST_JAW if "jaw" in name.lower() else REST_HEAD
-            share = float(kept_share(joints[0, index].norm(), limits))
-            if share < 1:
-                moved.append(f"{name} {_degrees(joints[0, index].norm())} degrees")
-                joints[0, index] *= share
-    eyes = [index for index, name in enumerate(model.free_joint_names) if "eye" in name.lower()]
+    names = [name.lower() for name in model.free_joint_names]
+    eyes = [index for index, name in enumerate(names) if "eye" in name]
+    for index in sorted({*range(len(names))} - {*eyes}):
+        share = float(kept_share(joints[0, index].norm(), _REST_JAW if "jaw" in names[index] else REST_HEAD))
+        if share < 1:
+            moved.append(f"{model.free_joint_names[index]} {_degrees(joints[0, index].norm())} degrees")
+            joints[0, index] *= share
     if eyes:
         angle = _gaze(joints[:, eyes], ahead.T @ matrix_from_axis_angle(calm.head_rotation))
         gaze = float(kept_share(angle, REST_GAZE))
@@ -99,7 +94,7 @@ def rest_of(calm: FaceParams, model: FaceModel, ahead: Float[Tensor, "3 3"] | No
     return AtRest(replace(calm, expression=expression, joints=joints, head_rotation=turn), tuple(moved))
 
 
-def kept_share(sizes: Float[Tensor, "*n"], limits: Limits) -> Float[Tensor, "*n"]:
+def kept_share(sizes: Float[Tensor, "*n"], limits: tuple[float, float]) -> Float[Tensor, "*n"]:
     """The part of each size that belongs to the person at rest: 1 up to the first limit, 0 from the second on."""
     first, second = limits
     return ((second - sizes) / (second - first)).clamp(0, 1)

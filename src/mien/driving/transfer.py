@@ -1,11 +1,16 @@
-"""The transfer of one person's motion to another person's avatar, relative to each one's face at rest."""
+"""The transfer of one person's motion to another person's avatar, relative to each one's face at rest.
+
+Expressions, gaze and head poses that training never saw are softened (`keep_to_filmed`).
+"""
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.avatar.baking import as_array
 from mien.driving.expression_map import fit_expression_map
 from mien.driving.motion import ARKIT_NAMES, Motion
 from mien.errors import UserError
@@ -13,6 +18,8 @@ from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.baked import Filmed
+from mien.runtime.filmed import within_filmed_inputs, within_filmed_poses
 from mien.runtime.named import within_lids
 
 
@@ -26,26 +33,19 @@ def drive(
 ) -> FaceParams:
     """Face parameters that make an avatar follow the driver. Its own identity and offsets stay.
 
-    Expression coefficients are added as differences from the neutral of each person. Joints, head rotation and
-    translation transfer the driver's motion relative to the driver's neutral frame to the avatar's neutral frame. A nod
-    therefore stays a nod even if the two people were filmed from different sides.
+    Expression coefficients are added as differences from the neutral of each person, and clamped to the bounds. Joints,
+    head rotation and translation transfer the driver's motion relative to the driver's neutral frame to the avatar's
+    neutral frame. A nod therefore stays a nod even if the two people were filmed from different sides.
 
-    Args:
-        driver: The timesteps to play.
-        driver_neutral: One timestep of the driver at rest, see `neutral_of`.
-        avatar_neutral: One timestep of the avatar's person at rest.
-        expression_bounds: `FaceModel.expression_bounds`, to which the results are clamped.
-        with_head_pose: Whether the head follows the driver's. If not, it stays at the avatar's neutral.
-        who: What messages call the driver, such as its file.
-
-    Raises:
-        UserError: the two were tracked with different face models.
+    Each neutral is one timestep (see `neutral_of`), and the bounds are `FaceModel.expression_bounds`. Without the head
+    pose, the head stays at the avatar's neutral. `who` is what messages call the driver, such as its file.
     """
     for name in ("expression", "joints"):
         theirs, ours = getattr(driver, name).shape[1:], getattr(avatar_neutral, name).shape[1:]
         if theirs != ours:
+            shown = ["x".join(map(str, shape)) for shape in (theirs, ours)]
             raise UserError(
-                f"{who} has {_times(theirs)} {name} parameters and the avatar has {_times(ours)}, so they were tracked "
+                f"{who} has {shown[0]} {name} parameters and the avatar has {shown[1]}, so they were tracked "
                 "with different face models; track the driver with the avatar's face model"
             )
     expression = avatar_neutral.expression + driver.expression - driver_neutral.expression
@@ -72,10 +72,6 @@ def drive(
     )
 
 
-def _times(shape: torch.Size) -> str:
-    return "x".join(str(size) for size in shape)
-
-
 def _relative_rotation(
     driver: Float[Tensor, "b *j 3"], driver_neutral: Float[Tensor, "1 *j 3"], avatar_neutral: Float[Tensor, "1 *j 3"]
 ) -> Float[Tensor, "b *j 3"]:
@@ -87,10 +83,9 @@ def _relative_rotation(
 def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FaceParams]:
     """The face parameters, for a face model, of a motion that another program recorded, and the driver at rest.
 
-    Coefficients go to the expressions of the same names, gaze goes to the eye joints, within what the lids
-    can follow (`within_lids`). At rest, which is one timestep,
-    all coefficients are zero, as in ARKit and MediaPipe, and the head has its median pose. A model without ARKit's
-    names gets the motion of the default model by `fit_expression_map`.
+    Coefficients go to the expressions of the same names, gaze goes to the eye joints, within what the lids can follow
+    (`within_lids`). At rest, which is one timestep, all coefficients are zero, as in ARKit and MediaPipe, and the head
+    has its median pose. A model without ARKit's names gets the motion of the default model by `fit_expression_map`.
     """
     known = [(ours, ARKIT_NAMES.index(name)) for ours, name in enumerate(model.expression_names) if name in ARKIT_NAMES]
     if not known:
@@ -114,3 +109,32 @@ def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FacePa
     return replace(
         face, expression=expression, joints=joints, head_rotation=rotation, head_translation=translation
     ), rest
+
+
+def keep_to_filmed(
+    face: FaceParams,
+    filmed: Filmed,
+    neutral: FaceParams,
+    expression_bounds: Float[Tensor, "e 2"],
+    eye: Float[Tensor, " 3"],
+) -> tuple[FaceParams, int]:
+    """Return the face softly within what training saw of this person, and how many timesteps that changes.
+
+    `neutral` is one timestep of this person at rest, and `eye` the position in metres of the camera that will see the
+    avatar, in world space.
+    """
+    count = face.expression.shape[1]
+    inputs = as_array(torch.cat([face.expression, face.joints.flatten(1)], dim=1))
+    rest = as_array(torch.cat([neutral.expression, neutral.joints.flatten(1)], dim=1))[0]
+    kept = within_filmed_inputs(filmed, inputs, rest, as_array(expression_bounds))
+    rotation, translation = as_array(face.head_rotation), as_array(face.head_translation)
+    turned = within_filmed_poses(filmed, rotation, translation, as_array(eye))
+    # Smaller changes of a coefficient, or of an angle in radians, are not seen.
+    changed = (np.abs(kept - inputs).max(1) > 1e-3) | (np.abs(turned - rotation).max(1) > 1e-3)
+    limited = replace(
+        face,
+        expression=torch.from_numpy(kept[:, :count].copy()).to(face.expression),
+        joints=torch.from_numpy(kept[:, count:].copy()).to(face.joints).reshape(face.joints.shape),
+        head_rotation=torch.from_numpy(turned).to(face.head_rotation),
+    )
+    return limited, int(changed.sum())

@@ -1,5 +1,5 @@
-"""Pictures, videos, sound and cameras: `source` opens them, `video_file` and `decoding` do so safely.
+"""Pictures, videos, sound and cameras: `source` opens them, `video`, `video_file` and `decoding` read them safely.
 
-`display`, `tone`, `colors` and `color_correction` lead to sRGB, `lens` and `fields` undo what a camera did, `pace`
-measures the frame rate, and `output` and `writing` write stills and films.
+`display`, `colors` and `color_correction` lead to sRGB, `lens` and `fields` undo what a camera did, and `output` and
+`writing` write stills and films.
 """

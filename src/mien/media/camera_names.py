@@ -10,7 +10,6 @@ from mien.errors import UserError
 
 CameraFormat = Literal["v4l2", "avfoundation", "dshow"]
 """FFmpeg's names of what reads cameras, on Linux, macOS and Windows."""
-_PREFIX = "camera"
 _FORMATS: dict[str, CameraFormat] = {"linux": "v4l2", "darwin": "avfoundation", "win32": "dshow"}
 _FIRST: dict[CameraFormat, str] = {"v4l2": "/dev/video0", "avfoundation": "0", "dshow": "video=0"}
 """The device that `camera` alone means."""
@@ -39,23 +38,19 @@ class CameraName:
 
     def __str__(self) -> str:
         """The name as it is typed."""
-        return f"{_PREFIX}:{self.device}"
+        return f"camera:{self.device}"
 
 
 def is_camera(by: str) -> bool:
     """Whether the driver of `--by` is a camera."""
-    return by == _PREFIX or by.startswith(f"{_PREFIX}:")
+    return by == "camera" or by.startswith("camera:")
 
 
 def camera_named(by: str, camera_format: CameraFormat | None) -> CameraName:
-    """The camera of `--by`.
-
-    Args:
-        by: `camera`, or `camera:` with a device, a file or an address.
-        camera_format: What reads devices (default: by platform).
-    """
+    """The camera of `--by`: `camera`, or `camera:` with a device, a file or an address."""
     chosen = camera_format or _FORMATS.get(sys.platform, "v4l2")
-    device = by[len(_PREFIX) + 1 :] if ":" in by else _first_device(chosen)
+    cameras = _listed() if chosen == "v4l2" else []
+    device = by.removeprefix("camera:") if ":" in by else str([*cameras, _FIRST[chosen]][0])
     if not device:
         raise UserError(f"--by {by}: names no camera; give camera alone, camera:/dev/video0, or camera:clip.mp4")
     name = CameraName(device, chosen)
@@ -69,8 +64,11 @@ def camera_named(by: str, camera_format: CameraFormat | None) -> CameraName:
 
 def devices() -> list[str]:
     """The video devices of this machine with their names, as far as the system lists them as files (Linux)."""
-    found = sorted(DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
-    return [f"{path}{_title(path.name)}" for path in found]
+    return [f"{path}{_title(path.name)}" for path in _listed()]
+
+
+def _listed() -> list[Path]:
+    return sorted(DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
 
 
 def remedy() -> str:
@@ -82,13 +80,6 @@ def remedy() -> str:
         "no camera was found on this machine; connect one, check that you may read it (on Linux, be in the group "
         "video), or let a video file play as a camera: --by camera:clip.mp4"
     )
-
-
-def _first_device(camera_format: CameraFormat) -> str:
-    if camera_format == "v4l2":
-        found = sorted(DEVICES.glob("video[0-9]*"), key=lambda path: (len(path.name), path.name))
-        return str(found[0]) if found else _FIRST["v4l2"]
-    return _FIRST[camera_format]
 
 
 def _title(device: str) -> str:

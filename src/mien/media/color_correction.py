@@ -13,12 +13,11 @@ from jaxtyping import Float, UInt8
 
 from mien.disk.limits import MAX_NUMBER
 from mien.errors import UserError
+from mien.media.colors import srgb_signal
 
 NAME = "color_correction"
-_CHUNK = 1 << 14
-"""Number of pixels that are computed at once."""
-_STEPS = 1 << 16
-"""Number of values of linear light for which the sRGB value is kept. A step is at most 0.05 of an 8-bit level."""
+_CHUNK = 1 << 14  # pixels that are computed at once
+_STEPS = 1 << 16  # values of linear light for which the sRGB value is kept, at most 0.05 of an 8-bit level apart
 
 _LINEAR, _PAIRS, _SQUARES, _CUBES = "r g b", "rg rb gb", "rr gg bb", "rrr ggg bbb"
 _TEN = f"{_LINEAR} {_PAIRS} {_SQUARES} rgb"
@@ -62,7 +61,7 @@ class ColorCorrection:
 
 
 def color_correction(matrix: Float[np.ndarray, "3 n"], where: str) -> ColorCorrection:
-    """Return the correction with these coefficients; `where` begins the message."""
+    """The correction with these coefficients; `where` begins the message."""
     if matrix.shape[1] not in _TERMS:
         raise UserError(
             f"{where}: has {matrix.shape[1]} terms for each channel; polynomials of Cheung 2004 have "
@@ -109,6 +108,4 @@ def _tables() -> tuple[Float[np.ndarray, " 256"], UInt8[np.ndarray, " s"]]:
     """Return the light of each 8-bit sRGB value, and the sRGB value of each step of light (IEC 61966-2-1)."""
     srgb = np.arange(256) / 255
     light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    step = np.arange(_STEPS) / (_STEPS - 1)
-    encoded = np.where(step <= 0.0031308, 12.92 * step, 1.055 * step ** (1 / 2.4) - 0.055)
-    return light.astype(np.float32), np.rint(255 * encoded).astype(np.uint8)
+    return light.astype(np.float32), np.rint(255 * srgb_signal(np.arange(_STEPS) / (_STEPS - 1))).astype(np.uint8)

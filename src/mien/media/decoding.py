@@ -15,16 +15,13 @@ from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.media.picture_files import png_fits
 
-MAX_PICTURE_PIXELS = MAX_SIDE**2
-"""Largest number of pixels of a picture, which is also the most that mien renders."""
+MAX_PICTURE_PIXELS = MAX_SIDE**2  # also the most that mien renders
 _MAX_FILE_BYTES = 8 * MAX_PICTURE_PIXELS + (64 << 20)
 """Largest file in bytes: an uncompressed picture of that size with four 16-bit channels, and metadata."""
 _MAX_SCANS = 200
 """Most scans of a JPEG. Cameras and editors write one to fourteen, and each costs a pass over the whole picture."""
-_NO_FRAMES = (0xC4, 0xC8, 0xCC)
-"""Markers between 0xC0 and 0xCF that start no JPEG frame."""
-_HEADER = 4096
-"""Bytes in which a PNG names its transparent colours."""
+_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # markers between 0xC0 and 0xCF that start no JPEG frame
+_TIFF_STARTS = (b"II\x2a\0", b"MM\0\x2a", b"II\x2b\0", b"MM\0\x2b")
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)
 """TIFF tags of the picture's size and of its tiles' size."""
@@ -53,12 +50,7 @@ def decode_picture(path: Path, flags: int) -> np.ndarray | None:
 
 
 def check_file_size(path: Path) -> None:
-    """Check that a file is no larger than that of any picture, before it is read.
-
-    Raises:
-        UserError: it is.
-        OSError: it is missing.
-    """
+    """Check that a file is no larger than that of any picture, before it is read."""
     size = path.stat().st_size
     if size > _MAX_FILE_BYTES:
         raise UserError(
@@ -70,19 +62,16 @@ def may_have_alpha(path: Path) -> bool:
     """Whether the header of a PNG, WebP or TIFF leaves room for alpha. Other pictures have none."""
     try:
         with path.open("rb") as file:
-            data = file.read(_HEADER)
+            data = file.read(4096)  # A PNG names its transparent colours here.
     except OSError:
         return False
     if data.startswith(b"\x89PNG"):
         return data[25:26] in (b"\4", b"\6") or b"tRNS" in data
-    return data[:4] in (b"II\x2a\0", b"MM\0\x2a", b"II\x2b\0", b"MM\0\x2b") or data[8:16] in (b"WEBPVP8X", b"WEBPVP8L")
+    return data.startswith(_TIFF_STARTS) or data[8:16] in (b"WEBPVP8X", b"WEBPVP8L")
 
 
 def announced_size(data: bytes) -> tuple[int, int] | None:
-    """Return the width and height that a PNG, JPEG, BMP, WebP or TIFF announces.
-
-    None for anything else or a cut header.
-    """
+    """Return the width and height that a picture announces; None for an unknown kind or a cut header."""
     for start, read in _READERS:
         if data.startswith(start):
             try:
@@ -150,13 +139,10 @@ def _tiff(data: bytes) -> tuple[int, int] | None:
     return (width, height) if width and height else None
 
 
-_READERS: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (
-    (b"\x89PNG\r\n\x1a\n", _png),
-    (b"\xff\xd8", _jpeg),
-    (b"BM", _bmp),
-    (b"RIFF", _webp),
-    (b"II\x2a\x00", _tiff),
-    (b"MM\x00\x2a", _tiff),
-    (b"II\x2b\x00", _tiff),
-    (b"MM\x00\x2b", _tiff),
+_READERS: tuple[tuple[tuple[bytes, ...], Callable[[bytes], tuple[int, int] | None]], ...] = (
+    ((b"\x89PNG\r\n\x1a\n",), _png),
+    ((b"\xff\xd8",), _jpeg),
+    ((b"BM",), _bmp),
+    ((b"RIFF",), _webp),
+    (_TIFF_STARTS, _tiff),
 )

@@ -9,9 +9,7 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
 from mien.errors import UserError
-from mien.media.alpha import as_matte, over_ground
-from mien.media.colors import UNSPECIFIED, Colors, colors_of
-from mien.media.tone import ToneMapper, is_wide, narrowed
+from mien.media.colors import UNSPECIFIED, Colors, ToneMapper, colors_of, is_wide, narrowed
 from mien.media.video_file import MAX_FRAME_PIXELS, TOO_MANY_PIXELS
 
 ACCURATE = Interpolation.BICUBIC | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
@@ -26,13 +24,9 @@ class Display:
     def __init__(
         self, name: str, pixel_aspect: float = 1.0, longest_side: int = 0, container: Colors = UNSPECIFIED
     ) -> None:
-        """Create the converter of one clip.
+        """Prepare. Frames are stretched to square pixels by `pixel_aspect`, the width of a pixel over its height.
 
-        Args:
-            name: name of the clip, for messages.
-            pixel_aspect: width of a pixel over its height. Frames are stretched, never shrunk, to square pixels.
-            longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
-            container: colours that the clip's container states.
+        Larger ones are shrunk by areas to a `longest_side` in pixels; 0 keeps the size. The container's colours count.
         """
         self._name = name
         self._pixel_aspect = pixel_aspect
@@ -49,20 +43,18 @@ class Display:
 
     def show(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
         """Return the frame as an sRGB picture."""
-        if _has_alpha(frame):
-            return self._show_over_ground(frame)
-        return self._turned(frame, self._converted(frame, *self._shown_size(frame, self._longest_side)))
+        shown_size = self._shown_size(frame, self._longest_side)
+        if not _has_alpha(frame):
+            return self._turned(frame, self._converted(frame, *shown_size))
+        size = self._shown_size(frame, 0)
+        shown = over_ground(self._converted(frame, *size), self._alpha(frame, *size))
+        return self._turned(frame, brought_to(shown, shown_size))
 
     def alpha(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w"] | None:
         """Return the alpha of a frame in its size as shown, or None if it has none or is opaque."""
         if not _has_alpha(frame):
             return None
         return as_matte(self._turned(frame, self._alpha(frame, *self._shown_size(frame, 0))))
-
-    def _show_over_ground(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
-        size = self._shown_size(frame, 0)
-        shown = over_ground(self._converted(frame, *size), self._alpha(frame, *size))
-        return self._turned(frame, brought_to(shown, self._shown_size(frame, self._longest_side)))
 
     def _alpha(self, frame: av.VideoFrame, width: int, height: int) -> UInt8[np.ndarray, "h w"]:
         with_alpha = self._reformatter.reformat(
@@ -94,7 +86,9 @@ class Display:
 
     def _shown_size(self, frame: av.VideoFrame, longest_side: int) -> tuple[int, int]:
         """Return the size before the frame is turned."""
-        width, height = _display_size(frame.width, frame.height, self._pixel_aspect, longest_side)
+        square = (frame.width * max(1.0, self._pixel_aspect), frame.height / min(1.0, self._pixel_aspect))
+        scale = min(1.0, longest_side / max(square)) if longest_side else 1.0
+        width, height = (max(1, round(side * scale)) for side in square)
         if width * height > MAX_FRAME_PIXELS:
             raise UserError(f"{self._name}: is shown with {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
         return width, height
@@ -132,12 +126,6 @@ def brought_to(
     return resized.astype(np.uint8, copy=False)
 
 
-def _display_size(width: int, height: int, pixel_aspect: float, longest_side: int) -> tuple[int, int]:
-    square = (width * max(1.0, pixel_aspect), height / min(1.0, pixel_aspect))
-    scale = min(1.0, longest_side / max(square)) if longest_side else 1.0
-    return max(1, round(square[0] * scale)), max(1, round(square[1] * scale))
-
-
 def _display_matrix(frame: av.VideoFrame) -> list[int]:
     """The upper two rows of the display matrix; empty if the frame has none.
 
@@ -162,3 +150,30 @@ def _turn(image: np.ndarray, matrix: list[int]) -> np.ndarray:
     else:
         flip_x, flip_y = a < 0, d < 0
     return np.ascontiguousarray(image[:: -1 if flip_y else 1, :: -1 if flip_x else 1])
+
+
+GROUND = 128
+"""Grey level that replaces what is transparent. Faces are found before it, and soft edges are cleaned of it as of any
+even background."""
+_NOISE, _FEW = 8, 0.01
+"""Levels by which compression lifts premultiplied colours above their alpha, and the share of pixels beyond that."""
+
+
+def over_ground(colors: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture with alpha over an even grey.
+
+    Colours that are nowhere brighter than their alpha are taken for premultiplied ones: some programs write those, and
+    OpenCV makes them of TIFF files.
+    """
+    if alpha.min() == 255:
+        return colors
+    soft = (alpha > 0) & (alpha < 255)
+    brighter = colors[soft].max(axis=-1, initial=0) > alpha[soft].astype(np.int16) + _NOISE
+    share = alpha[..., None].astype(np.float32) / 255
+    front = colors * (share > 0 if soft.any() and brighter.mean() < _FEW else share)
+    return np.rint(np.minimum(front + (1 - share) * GROUND, 255)).astype(np.uint8)
+
+
+def as_matte(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the alpha, or None if it is opaque everywhere, as it is in many files that have a channel for it."""
+    return np.ascontiguousarray(alpha) if alpha.min() < 128 else None

@@ -10,7 +10,7 @@ Frames that do not say that they are interlaced pass unchanged, bit by bit.
 from collections import deque
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import av
 import av.error
@@ -19,25 +19,19 @@ from av.filter import Graph
 from av.filter.context import FilterContext
 from jaxtyping import UInt8
 
-from mien.media.choices import Deinterlace
-
 _TOP_FIRST, _BOTTOM_FIRST = (2, 4), (3, 5)
 """FFmpeg's codes of the order of fields. Programs use both codes of a pair alike."""
 _STATES_FIELDS = frozenset(
     {"h264", "hevc", "vvc", "mpeg1video", "mpeg2video", "mpeg4", "vc1", "prores", "dnxhd", "dvvideo", "mjpeg"}
 )
 """Codecs that mark each frame as interlaced or not. For others, the container speaks for all frames."""
-_FIELD_PICTURES = frozenset({"hevc"})
-"""Codecs whose interlaced pictures are single fields, of half the height. FFmpeg does not join them."""
-_LEAST_SIDE = 4
-"""Smaller pictures are passed unchanged: bwdif refuses them."""
-_COMB = 8
-"""Least difference of neighbouring lines in a comb, in levels of 255."""
-_COMB_PIXELS = 1 << 20
-"""Pixels in which combs are counted. In larger pictures, columns are left out."""
+_LEAST_SIDE = 4  # smaller pictures are passed unchanged: bwdif refuses them
+_COMB = 8  # least difference of neighbouring lines in a comb, in levels of 255
+_COMB_PIXELS = 1 << 20  # pixels in which combs are counted. In larger pictures, columns are left out
 
-
-_TICK = Fraction(1, 1000)
+Deinterlace = Literal["auto", "always", "never"]
+"""auto deinterlaces the frames that are marked as interlaced, by themselves or by their container; always all; never
+none."""
 
 
 class FieldFrame(NamedTuple):
@@ -58,8 +52,8 @@ class FieldOrder(NamedTuple):
 
     @property
     def has_field_pictures(self) -> bool:
-        """Whether interlaced pictures of this codec are single fields."""
-        return self.codec in _FIELD_PICTURES
+        """Whether interlaced pictures are single fields, of half the height. FFmpeg does not join them."""
+        return self.codec == "hevc"
 
     @property
     def parity(self) -> str:
@@ -74,20 +68,15 @@ class FieldOrder(NamedTuple):
 
 
 def deinterlace(frames: Iterable[av.VideoFrame], order: FieldOrder, mode: Deinterlace) -> Iterator[FieldFrame]:
-    """Yield every frame with its picture, in order. At most two frames are held.
-
-    Args:
-        frames: decoded frames.
-        order: what their stream says about fields.
-        mode: auto deinterlaces the frames that are marked as interlaced, by themselves or by their container; always
-            and never do as they say.
-    """
+    """Yield every decoded frame with its picture, in order. At most two frames are held."""
     graph: _Graph | None = None
     for frame in frames:
         if graph is not None and not graph.fits(frame):
             yield from graph.finish()
             graph = None
-        if graph is None and _is_due(frame, order, mode):
+        unfit = order.has_field_pictures or min(frame.width, frame.height) < _LEAST_SIDE
+        marked = frame.interlaced_frame or order.is_interlaced
+        if graph is None and not unfit and (mode == "always" or (mode == "auto" and marked)):
             graph = _Graph(frame, order, mode)
         if graph is None:
             yield FieldFrame(frame, frame, False)
@@ -95,12 +84,6 @@ def deinterlace(frames: Iterable[av.VideoFrame], order: FieldOrder, mode: Deinte
             yield from graph.push(frame)
     if graph is not None:
         yield from graph.finish()
-
-
-def _is_due(frame: av.VideoFrame, order: FieldOrder, mode: Deinterlace) -> bool:
-    if mode == "never" or order.has_field_pictures or min(frame.width, frame.height) < _LEAST_SIDE:
-        return False
-    return mode == "always" or frame.interlaced_frame or order.is_interlaced
 
 
 class _Graph:
@@ -112,7 +95,7 @@ class _Graph:
         parity = "auto" if first.interlaced_frame else order.parity
         self._graph = Graph()
         source = self._graph.add_buffer(
-            width=first.width, height=first.height, format=first.format, time_base=first.time_base or _TICK
+            width=first.width, height=first.height, format=first.format, time_base=first.time_base or Fraction(1, 1000)
         )
         wanted = f"mode=send_frame:parity={parity}:deint={'all' if self._takes_all else 'interlaced'}"
         steps: list[FilterContext] = [source, self._graph.add("bwdif", wanted), self._graph.add("buffersink")]
@@ -168,8 +151,3 @@ def _alternating(lines: UInt8[np.ndarray, "h w"]) -> float:
     rising = np.minimum(np.minimum(first, second), third) > _COMB
     falling = np.maximum(np.maximum(first, second), third) < -_COMB
     return float((rising | falling).mean())
-
-
-def no_combs() -> float:
-    """Return 0, the combs of a picture that is no frame of a video."""
-    return 0.0

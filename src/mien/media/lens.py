@@ -15,10 +15,7 @@ from mien.render.camera_paths import names_of_distortion
 NAME = "distortion"
 _LENGTHS = (4, 5, 8, 12, 14)
 _ORDER = "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty"
-_GRID = 65
-"""Points along each side of the grid on which a distortion is checked."""
-_MAX_SKEW = 1e-3
-"""Largest skew of pixels, in focal lengths. OpenCV's model has none."""
+_GRID = 65  # points along each side of the grid on which a distortion is checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +86,10 @@ def lens_of_entry(entry: dict[str, Any], camera: Camera, where: str) -> Lens | N
         )
     if not np.isfinite(numbers).all():
         raise UserError(f"{where}: {NAME} {given!r:.60} is not a list of numbers; give OpenCV's coefficients {_ORDER}")
-    return _checked(Lens(camera, tuple(numbers.tolist())), where) if numbers.any() else None
-
-
-def _checked(lens: Lens, where: str) -> Lens:
-    K = lens.camera.K
-    if abs(float(K[0, 1])) > _MAX_SKEW * float(K[0, 0]):
+    if not numbers.any():
+        return None
+    lens, K = Lens(camera, tuple(numbers.tolist())), camera.K
+    if abs(float(K[0, 1])) > 1e-3 * float(K[0, 0]):
         raise UserError(f"{where}: has a {NAME} and a skew (K[0][1] = {float(K[0, 1]):g}), and OpenCV's model has no "
                         "skew; calibrate without it")  # fmt: skip
     if lens.folds():

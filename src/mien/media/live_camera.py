@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import av
 import av.error
@@ -33,6 +32,8 @@ _ASKED = {"framerate": "30", "video_size": "640x480"}
 _STREAM = {"flags": "low_delay", "timeout": "5000000"}
 """What a stream is asked for: no reordering, and an error after five seconds without an answer (in microseconds)."""
 _RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
+_Opened = tuple[contextlib.ExitStack, Iterator[tuple[float, av.VideoFrame]]]
+"""What closes a source, and its frames with their times in seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +61,10 @@ class LiveCamera:
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[threading.Event, float], object] = threading.Event.wait,
     ) -> None:
-        """Prepare to read a camera.
+        """Prepare to read a camera. A file starts `again` at its end.
 
-        Args:
-            name: The camera.
-            again: Whether a file starts again at its end.
-            say: Is called with one line when the camera vanishes and when it is back.
-            clock: Returns the time in seconds.
-            wait: Waits for an event, at most so many seconds: between the frames of a file, and for a camera that has
-                vanished.
+        `say` gets a line when the camera vanishes and when it is back. `wait` waits for an event, at most so many
+        seconds: between the frames of a file, and for a camera that has vanished.
         """
         self.name = name
         self._again, self._say, self._clock, self._wait = again, say, clock, wait
@@ -94,9 +90,7 @@ class LiveCamera:
         """Start to read."""
         self._thread.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stopping.set()
         with self._changed:
             self._changed.notify_all()
@@ -113,32 +107,32 @@ class LiveCamera:
     def _is_new(self, after: int) -> bool:
         return self._newest is not None and self._newest.number > after
 
-    def _open(self) -> "contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]]":
+    def _open(self) -> _Opened:
+        stack = contextlib.ExitStack()
         source = _file(Path(self.name.device)) if self.name.is_file else _device(self.name)
-        frames = source.__enter__()
-        return _Opened(source, frames)
+        return stack, stack.enter_context(source)
 
     def _run(self) -> None:
         try:
-            opened = self._opened
+            opened: _Opened | None = self._opened
             while not self._stopping.is_set():
+                opened = opened or self._reopen()
                 if opened is None:
-                    opened = self._reopen()
                     continue
-                with opened as frames:
-                    self._read(frames)
+                self._read(*opened)
                 opened = None
                 if self.name.is_file and not self._again:
                     break
-                if not self.name.is_file:
-                    self._lose()
+                if not self.name.is_file and not self.is_lost and not self._stopping.is_set():
+                    self.is_lost = True
+                    self._say(f"{self.name}: gives no more pictures; mien waits until it is back")
         except BaseException as error:  # noqa: BLE001
             self.error = error
         with self._changed:
             self.ended = True
             self._changed.notify_all()
 
-    def _reopen(self) -> "contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]] | None":
+    def _reopen(self) -> _Opened | None:
         if not self.name.is_file:
             self._wait(self._stopping, _RETRY_SECONDS)
         try:
@@ -146,13 +140,7 @@ class LiveCamera:
         except UserError:
             return None
 
-    def _lose(self) -> None:
-        """Say once that the camera is away."""
-        if not self.is_lost and not self._stopping.is_set():
-            self.is_lost = True
-            self._say(f"{self.name}: gives no more pictures; mien waits until it is back")
-
-    def _read(self, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
+    def _read(self, source: contextlib.ExitStack, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
         """Keep each frame when it comes, until the end or an error of the device."""
         container = UNSPECIFIED
         if self.name.is_file:
@@ -161,7 +149,7 @@ class LiveCamera:
         display = Display(str(self.name), 1.0, _LIVE_SIDE, container)
         began: float | None = None
         size: tuple[int, int] | None = None
-        with contextlib.suppress(av.error.FFmpegError, OSError):
+        with contextlib.suppress(av.error.FFmpegError, OSError), source:
             for due, frame in frames:
                 now = self._clock()
                 if self.name.is_file:
@@ -189,22 +177,6 @@ class LiveCamera:
             self._changed.notify_all()
 
 
-class _Opened(contextlib.AbstractContextManager[Iterator[tuple[float, av.VideoFrame]]]):
-    """An entered source, which is left at the end of the `with` statement."""
-
-    def __init__(
-        self, source: contextlib.AbstractContextManager[object], frames: Iterator[tuple[float, av.VideoFrame]]
-    ) -> None:
-        self._source, self._frames = source, frames
-
-    def __enter__(self) -> Iterator[tuple[float, av.VideoFrame]]:
-        return self._frames
-
-    def __exit__(self, *error: object) -> None:
-        with contextlib.suppress(av.error.FFmpegError, OSError):
-            self._source.__exit__(None, None, None)
-
-
 @contextlib.contextmanager
 def _file(path: Path) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
     with open_video(path) as (container, stream):
@@ -214,8 +186,7 @@ def _file(path: Path) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
 
 @contextlib.contextmanager
 def _device(name: CameraName) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
-    container = _open_device(name)
-    with container:
+    with _open_device(name) as container:
         if not container.streams.video:
             raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
         yield _timed(container, container.streams.video[0], DEFAULT_FPS)

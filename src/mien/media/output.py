@@ -1,4 +1,4 @@
-"""The output of pictures, chosen by the ending of a path. It is checked before any work, without heavy libraries."""
+"""Endings of files: of sound, and of pictures that are written. They are checked before any work, without libraries."""
 
 import re
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from typing import Literal
 from mien.disk.files import check_writable
 from mien.errors import UserError
 
+SOUND_ENDINGS = (".wav", ".mp3", ".flac", ".ogg", ".opus", ".m4a", ".aac", ".aif", ".aiff")
 ENDINGS = ".png (one picture), a folder or NAME_%06d.png (numbered pictures), .mp4 or .webm"
 _NUMBER = re.compile(r"%0?\d*d")
 

@@ -23,17 +23,8 @@ from mien.machine import system
 MAX_KEPT_BYTES = 256 << 20
 """Number of bytes that a map hands out before it gives its pages back, and largest stack that is held in memory."""
 _PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
-_MAX_PNG_HEADER_BYTES = 1 << 16
-"""Most bytes of a PNG file besides those of its pixels."""
 _DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)
 """None if the system has no such call (Windows)."""
-
-
-class _Tally:
-    """Counts the bytes handed out by a map and all of its views."""
-
-    def __init__(self) -> None:
-        self.handed_out = 0
 
 
 class PictureMap(np.memmap):
@@ -43,49 +34,41 @@ class PictureMap(np.memmap):
     given back are read again when they are needed, mostly from the system's file cache.
     """
 
-    _tally: _Tally | None = None
+    _handed_out: list[int] | None = None
+    """The bytes that the map and all of its views have handed out, as one number."""
 
     def __array_finalize__(self, obj: Any) -> None:
         """Let views share the count of the array that they view."""
         super().__array_finalize__(obj)
-        self._tally = getattr(obj, "_tally", None)
+        self._handed_out = getattr(obj, "_handed_out", None)
 
     def __getitem__(self, index: Any) -> Any:
         """Index the map, and count the bytes that are handed out."""
         found = super().__getitem__(index)
-        if isinstance(found, np.ndarray) and self._tally is not None:
-            self._tally.handed_out += found.nbytes
-            if self._tally.handed_out > MAX_KEPT_BYTES:
-                self._tally.handed_out = 0
-                self._give_back()
+        if isinstance(found, np.ndarray) and self._handed_out is not None:
+            self._handed_out[0] += found.nbytes
+            if self._handed_out[0] > MAX_KEPT_BYTES:
+                self._handed_out[0] = 0
+                pages = getattr(self, "_mmap", None)
+                if pages is not None and _DONT_NEED is not None:
+                    pages.madvise(_DONT_NEED)
         return found
-
-    def _give_back(self) -> None:
-        pages = getattr(self, "_mmap", None)
-        if pages is not None and _DONT_NEED is not None:
-            pages.madvise(_DONT_NEED)
 
 
 def map_pictures(file: Any, shape: tuple[int, ...]) -> PictureMap:
     """Map the pictures [..., h, w] or [..., h, w, 3] in a raw file, given as a path or an open file."""
     pictures = cast(PictureMap, PictureMap(file, np.uint8, "r", shape=shape))
-    pictures._tally = _Tally()
+    pictures._handed_out = [0]
     return pictures
 
 
 class PictureStack:
-    """Pictures that are written in any order and read as one array. A small array is in memory, a large one on disk.
-
-    The file on disk has no name, and is removed together with the array.
-    """
+    """Pictures written in any order and read as one array: a small one in memory, a large one in an unnamed file."""
 
     def __init__(self, shape: tuple[int, ...], folder: Path | None = None) -> None:
         """Make room for an array of the given `shape`, [t, c, h, w].
 
         A large array is in `folder`, by default in the system's folder for temporary files.
-
-        Raises:
-            CannotWriteError: the folder cannot be written to.
         """
         self._shape, self._folder = shape, folder or Path(tempfile.gettempdir())
         self._file = None
@@ -100,11 +83,7 @@ class PictureStack:
             raise cannot_write(self._folder, error) from None
 
     def write(self, timestep: int, camera: int, picture: UInt8[np.ndarray, "h w"]) -> None:
-        """Write one picture to its place.
-
-        Raises:
-            CannotWriteError: the disk is full.
-        """
+        """Write one picture to its place."""
         if self._file is None:
             self._array[timestep, camera] = picture
             return
@@ -148,17 +127,11 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "h w *c"]) -> None:
 
 
 def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndarray, "..."]:
-    """Read a picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB). Its header is checked first.
-
-    Args:
-        path: the file, which must not be a link.
-        shape: the shape that the picture must have.
-        remedy: advice for the message if the picture is missing or damaged.
-    """
+    """Read a picture that mien wrote inside a workspace, [h, w] or [h, w, 3] (RGB). Its header is checked first."""
     try:
         with open_to_read(path) as file:
             # A PNG of noise is a little larger than its pixels; a file that is much longer counts as damaged.
-            most = 2 * math.prod(shape) + _MAX_PNG_HEADER_BYTES
+            most = 2 * math.prod(shape) + (1 << 16)
             data = file.read(min(most, os.fstat(file.fileno()).st_size))
     except FileNotFoundError:
         raise UserError(f"{path}: missing; {remedy}") from None
@@ -179,11 +152,7 @@ def decode_png(path: Path, shape: tuple[int, ...], remedy: str) -> UInt8[np.ndar
 
 
 def write_at(file: int, picture: UInt8[np.ndarray, "..."], offset: int) -> None:
-    """Write a picture's bytes at an offset in an open file.
-
-    Raises:
-        OSError: the disk is full.
-    """
+    """Write a picture's bytes at an offset in an open file."""
     data = np.ascontiguousarray(picture).data.cast("B")
     while data:
         written = system.write_at(file, data, offset)

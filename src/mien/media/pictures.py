@@ -16,8 +16,6 @@ Box = tuple[int, int, int, int]
 """Left, top, width and height of a part of a picture, in pixels."""
 ERROR_LIMIT = 0.25
 """Error, for colours in 0..1, that gets the brightest colour of `error_heat`."""
-_HEAT_STOPS = 6
-"""Number of colours in the gradient of a heat scale."""
 
 
 def to_uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -33,7 +31,7 @@ def heat_colors(values: Float[np.ndarray, "h w"], limit: float = 1.0) -> UInt8[n
 
 def heat_gradient() -> str:
     """The colours of `heat_colors` from 0 to its limit, as a CSS gradient from left to right."""
-    stops = heat_colors(np.linspace(0, 1, _HEAT_STOPS)[None])[0].tolist()
+    stops = heat_colors(np.linspace(0, 1, 6)[None])[0].tolist()
     return f"linear-gradient(90deg,{', '.join(f'rgb{tuple(stop)}' for stop in stops)})"
 
 
@@ -53,7 +51,9 @@ def side_by_side(
     height = images[0].shape[0]
     row: list[np.ndarray] = []
     for image in images:
-        row += [np.full((height, gap, 3), color, np.uint8), _scaled_to_height(image, height)]
+        size = (max(1, round(image.shape[1] * height / image.shape[0])), height)
+        scaled = image if image.shape[0] == height else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        row += [np.full((height, gap, 3), color, np.uint8), scaled]
     return np.concatenate(row[1:], axis=1)
 
 
@@ -92,10 +92,3 @@ def picture_uri(image: UInt8[np.ndarray, "_ _ 3"], jpeg_quality: int | None = 90
 def data_uri(media_type: str, data: bytes) -> str:
     """The content of a file as a data URI for HTML."""
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-def _scaled_to_height(image: UInt8[np.ndarray, "_ _ 3"], height: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    if image.shape[0] == height:
-        return image
-    width = max(1, round(image.shape[1] * height / image.shape[0]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

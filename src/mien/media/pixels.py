@@ -6,14 +6,11 @@ import zlib
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-_ROWS = 512
-"""Number of rows converted at a time. An 8192x8192 picture would otherwise be in memory four times."""
+_ROWS = 512  # converted at a time. An 8192x8192 picture would otherwise be in memory four times
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_COLORS = {3: 2, 4: 6}
 """Channels -> colour type of a PNG (W3C PNG, table 11.1): RGB, and RGB with alpha."""
-_PNG_UP = 2
-"""Filter of a row: its difference to the row above."""
-_PNG_LEVEL = 6
+_PNG_UP = 2  # filter of a row: its difference to the row above
 
 
 def to_rgb(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -45,7 +42,7 @@ def png_bytes(picture: UInt8[np.ndarray, "h w c"]) -> bytes:
     filtered[0, 1:] = rows[0]
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])  # modulo 256, as the format has it
     header = struct.pack(">IIBBBBB", width, height, 8, _PNG_COLORS[channels], 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), _PNG_LEVEL)), (b"IEND", b""))
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b""))
     return _PNG_SIGNATURE + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
     )

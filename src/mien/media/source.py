@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,12 +15,12 @@ from jaxtyping import UInt8
 
 from mien.disk.inside import listed
 from mien.errors import UserError
-from mien.media.alpha import as_matte, over_ground
-from mien.media.choices import Deinterlace
 from mien.media.color_correction import ColorCorrection
 from mien.media.decoding import check_file_size, decode_picture, may_have_alpha
+from mien.media.display import as_matte, over_ground
+from mien.media.fields import Deinterlace
 from mien.media.lens import Lens
-from mien.media.video import LazyFrame, count_frames, probe_video, read_lazily
+from mien.media.video import LazyFrame, VideoInfo, count_frames, probe_video, read_lazily
 from mien.media.video_file import VIDEO_SUFFIXES
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
@@ -42,25 +42,6 @@ class FrameSelection:
     """Frames at the beginning of the source that do not exist, for a camera that started before the others."""
 
 
-class SourceFrame(NamedTuple):
-    """A frame that was taken from a source."""
-
-    number: int
-    """Index of the frame in the source, from 0, counting also the frames that the selection leaves out."""
-    seconds: float
-    """Time since the first frame taken, in seconds."""
-    picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
-    """Makes the sRGB picture. This is the costly part, so call it only if the picture is needed."""
-    size: Callable[[], tuple[int, int]]
-    """Returns the width and height in pixels of the picture before it is shrunk. They may change within a video."""
-    is_deinterlaced: bool
-    """Whether the picture is made of an interlaced frame."""
-    alpha: Callable[[], UInt8[np.ndarray, "h w"] | None]
-    """Makes the alpha of the picture before it is shrunk; None if it has none or is opaque. It ignores the lens."""
-    combs: Callable[[], float]
-    """Measures the combs of the frame as stored, as a part of its pixels (`mien.media.fields.combs`)."""
-
-
 @dataclass(frozen=True)
 class FrameSource:
     """A video file or a folder of images that can be read any number of times, a frame at a time."""
@@ -70,38 +51,34 @@ class FrameSource:
     fps: float
     """Frame rate of the frames taken, so after `stride`."""
     expected_frames: int
-    """Expected number of frames, for progress bars. Only reading the source gives the true number."""
+    """For progress bars. Only reading the source gives the true number."""
     content_hash: str
     """Hash of the file, or of the names and contents of all images."""
-    hdr: str = ""
-    """HDR transfer function: PQ, HLG, or empty for ordinary pictures."""
+    video: VideoInfo
+    """What a video states about itself, which is nothing for a folder."""
     quarter_turns: int = 0
     """Number of quarter turns clockwise, besides the file's own rotation flag."""
     deinterlace: Deinterlace = "auto"
     """Which frames of a video are deinterlaced."""
     stream: int | None = None
     """Index of the video's stream that is read. None for a folder."""
-    other_streams: tuple[int, ...] = ()
-    """Indices of the video's other streams of pictures."""
-    has_field_pictures: bool = False
-    """Whether the pictures are single fields of interlaced video, of half the height (HEVC)."""
     lens: Lens | None = None
-    """Lens whose distortion is taken out of the turned pictures. None for pictures as they are."""
+    """Lens whose distortion is taken out of the turned pictures."""
     colors: ColorCorrection | None = None
-    """Correction of the pictures' colours. None for colours as filmed."""
+    """Correction of the pictures' colours."""
 
-    def frames(self, longest_side: int = 0) -> Iterator[SourceFrame]:
+    def frames(self, longest_side: int = 0) -> Iterator[LazyFrame]:
         """Yield the frames taken. Pictures are shrunk to `longest_side` pixels unless that is 0."""
         if self.path.is_dir():
             everything = _read_images(self.path, self.fps * self.selection.stride, longest_side)
         else:
             everything = read_lazily(self.path, longest_side, self.deinterlace, self.stream)
         taken, candidates, first, origin = 0, 0, 0.0, 0.0
-        for number, (seconds, picture, size, is_deinterlaced, alpha, combs) in enumerate(everything):
-            if number < self.selection.offset:
+        for frame in everything:
+            if frame.number < self.selection.offset:
                 continue
-            origin = seconds if number == self.selection.offset and number else origin
-            seconds -= origin
+            origin = frame.seconds if frame.number == self.selection.offset and frame.number else origin
+            seconds = frame.seconds - origin
             if seconds < self.selection.start - 1e-6:
                 continue
             if self.selection.end and seconds >= self.selection.end - 1e-6:
@@ -110,11 +87,7 @@ class FrameSource:
             if (candidates - 1) % self.selection.stride:
                 continue
             first = seconds if taken == 0 else first
-            turned = partial(_turned, picture, self.quarter_turns) if self.quarter_turns else picture
-            given = partial(self._as_calibrated, turned) if self.lens or self.colors else turned
-            shown = partial(_swapped, size) if self.quarter_turns % 2 else size
-            matte = partial(_turned, alpha, self.quarter_turns) if self.quarter_turns else alpha
-            yield SourceFrame(number, seconds - first, given, shown, is_deinterlaced, matte, combs)
+            yield self._as_filmed(frame._replace(seconds=seconds - first))
             taken += 1
             if taken == self.selection.max_frames:
                 break
@@ -128,8 +101,16 @@ class FrameSource:
         picture = picture if self.colors is None else self.colors.apply(picture)
         return picture if self.lens is None else self.lens.straighten(picture)
 
-    def _as_calibrated(self, picture: Callable[[], np.ndarray]) -> np.ndarray:
-        return self.calibrated(picture())
+    def _as_filmed(self, frame: LazyFrame) -> LazyFrame:
+        """Return the frame with its pictures turned and calibrated."""
+        if self.quarter_turns:
+            picture, alpha = (partial(_turned, make, self.quarter_turns) for make in (frame.picture, frame.alpha))
+            given, step = frame.size, -1 if self.quarter_turns % 2 else 1
+            frame = frame._replace(picture=picture, size=lambda: given()[::step], alpha=alpha)
+        if self.lens or self.colors:
+            make = frame.picture
+            frame = frame._replace(picture=lambda: self.calibrated(make()))
+        return frame
 
     def count(self) -> int:
         """Count the frames in the source, with those that the selection leaves out."""
@@ -144,56 +125,31 @@ def open_source(
     deinterlace: Deinterlace = "auto",
     stream: int | None = None,
 ) -> FrameSource:
-    """Open a source without reading its frames.
+    """Open a video, or a folder of images in the natural order of their names, without reading its frames.
 
-    Args:
-        path: a video file, or a folder of images, which are read in the natural order of their names.
-        selection: which frames to take.
-        fps: frame rate of a folder of images, in frames per second. A video has its own.
-        quarter_turns: number of quarter turns clockwise.
-        deinterlace: which frames of a video are deinterlaced.
-        stream: index of a video's stream; by default that of `mien.media.video_file.find_streams`.
+    `fps` is for a folder: a video has its own. `stream` is by default that of `mien.media.video_file.find_streams`.
     """
-    info = None
     if path.is_dir():
         images = list_images(path)
-        total = len(images)
         for image in images:
             check_file_size(image)
-        content_hash = _hash_files(images, with_names=True)
+        info, content_hash = VideoInfo(fps, len(images)), _hash_files(images, with_names=True)
     else:
-        info = probe_video(path, stream)
-        fps, total = info.fps, info.frames
-        content_hash = _hash_files([path], with_names=False)
+        info, content_hash = probe_video(path, stream), _hash_files([path], with_names=False)
+    fps, total = info.fps, info.frames
     last = min(total, round(selection.end * fps)) if selection.end else total
     last = min(last, max(0, total - selection.offset))
     remaining = max(0, last - round(selection.start * fps))
     expected = -(-remaining // selection.stride)
     if selection.max_frames:
         expected = min(expected, selection.max_frames) if total else selection.max_frames
-    return FrameSource(
-        path,
-        selection,
-        fps / selection.stride,
-        expected,
-        content_hash,
-        info.hdr if info else "",
-        quarter_turns,
-        deinterlace,
-        info.stream if info else None,
-        info.other_streams if info else (),
-        info is not None and info.has_field_pictures,
-    )
+    fps /= selection.stride
+    return FrameSource(path, selection, fps, expected, content_hash, info, quarter_turns, deinterlace, info.stream)
 
 
 def _turned(picture: Callable[[], np.ndarray | None], quarter_turns: int) -> Any:
     made = picture()
     return made if made is None else np.ascontiguousarray(np.rot90(made, -quarter_turns))
-
-
-def _swapped(size: Callable[[], tuple[int, int]]) -> tuple[int, int]:
-    width, height = size()
-    return height, width
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -206,12 +162,9 @@ def list_images(folder: Path) -> list[Path]:
         cameras = "; if it holds those of calibrated cameras, add --calibration FILE" if rig else ""
         remedy = f"give {videos[0]} itself" if videos else "give a video or a folder of .png or .jpg files"
         raise UserError(f"{folder}: holds no images; {remedy}{cameras}")
-    return sorted(images, key=lambda path: [int(part) if part.isdigit() else part for part in _parts(path.name)])
-
-
-def _parts(name: str) -> list[str]:
     # Digits are always at odd positions, so that numbers are only compared with numbers.
-    return re.split(r"([0-9]+)", name)
+    parts = {path: re.split(r"([0-9]+)", path.name) for path in images}
+    return sorted(images, key=lambda path: [int(part) if part.isdigit() else part for part in parts[path]])
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
@@ -234,11 +187,6 @@ def _read_with_alpha(path: Path) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.n
     return None if alpha is None else (levels[..., 2::-1], alpha)
 
 
-def _alpha_of(path: Path) -> UInt8[np.ndarray, "h w"] | None:
-    read = _read_with_alpha(path)
-    return None if read is None else read[1]
-
-
 def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFrame]:
     shape: tuple[int, ...] | None = None
 
@@ -256,20 +204,18 @@ def _read_images(folder: Path, fps: float, longest_side: int) -> Iterator[LazyFr
                 f"{path}: is {image.shape[1]}x{image.shape[0]}, but the images before it are {shape[1]}x{shape[0]}; "
                 "give images of one size"
             )
-        return shrink_to(image, longest_side) if longest_side else image
+        size = shrunk_size(image.shape[1], image.shape[0], longest_side or max(image.shape))
+        if size == (image.shape[1], image.shape[0]):
+            return image
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+    def alpha(path: Path) -> np.ndarray | None:
+        with_alpha = _read_with_alpha(path)
+        return None if with_alpha is None else with_alpha[1]
 
     images = list_images(folder)
     for index, path in enumerate(images):
-        yield LazyFrame(index / fps, partial(read, path), size, alpha=partial(_alpha_of, path))
-
-
-def shrink_to(image: UInt8[np.ndarray, "h w 3"], longest_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Return the picture shrunk to at most `longest_side` pixels per side, area-averaged. It is never enlarged."""
-    height, width = image.shape[:2]
-    width_out, height_out = shrunk_size(width, height, longest_side)
-    if (width_out, height_out) == (width, height):
-        return image
-    return cv2.resize(image, (width_out, height_out), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+        yield LazyFrame(index, index / fps, partial(read, path), size, alpha=partial(alpha, path))
 
 
 def shrunk_size(width: int, height: int, longest_side: int) -> tuple[int, int]:

@@ -12,29 +12,33 @@ from typing import NamedTuple
 import av
 import av.error
 import numpy as np
-from av.container import InputContainer
+from av.audio.resampler import AudioResampler
+from av.container import InputContainer, OutputContainer
 from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from av.video.stream import VideoStream
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.machine.progress import say
-from mien.media.choices import Deinterlace
-from mien.media.colors import Colors, colors_of
+from mien.media.colors import colors_of
 from mien.media.display import ACCURATE, Display, brought_to, has_shape
-from mien.media.fields import FieldOrder, combs, deinterlace, no_combs
-from mien.media.sound import add_sound
-from mien.media.video_file import TOO_MANY_PIXELS, create_video, find_streams, open_video, read_container_tags
+from mien.media.fields import Deinterlace, FieldOrder, combs, deinterlace
+from mien.media.video_file import (
+    TOO_MANY_PIXELS,
+    create_video,
+    find_streams,
+    open_sound,
+    open_video,
+    read_container_tags,
+)
 
 _THREADS = 2
 DEFAULT_FPS = 25.0
 """Frames a second of a stream that names no rate."""
 _WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 """Decoders that read the alpha of a codec, if others do not."""
-_MAX_PROBED = 100
-"""Packets at the beginning in which a probe looks for a picture."""
 
 
 @dataclass(frozen=True)
@@ -45,67 +49,57 @@ class VideoInfo:
     """Average frames per second."""
     frames: int
     """Expected number of frames; 0 if the file does not state it."""
-    hdr: str
+    hdr: str = ""
     """HDR transfer function: PQ, HLG, or empty for ordinary video."""
-    has_field_pictures: bool
+    has_field_pictures: bool = False
     """Whether its pictures are single fields of interlaced video, of half the height (HEVC)."""
-    stream: int
+    stream: int | None = None
     """Index of the stream that is read."""
-    other_streams: tuple[int, ...]
+    other_streams: tuple[int, ...] = ()
     """Indices of the file's other streams of pictures."""
 
 
 class LazyFrame(NamedTuple):
-    """A frame that was read. Its picture is made only on request."""
+    """A frame of a source. Its picture, which is the costly part, is made only on request."""
 
+    number: int
+    """Index in the source, from 0. Frames that a selection leaves out count, too."""
     seconds: float
-    """Time since the first frame, in seconds."""
+    """Time since the first frame, or since the first one that a selection takes."""
     picture: Callable[[], UInt8[np.ndarray, "h w 3"]]
     """Makes the sRGB picture."""
     size: Callable[[], tuple[int, int]]
-    """Returns the width and height in pixels of the picture as it is shown, before it is shrunk."""
+    """Width and height in pixels of the picture before it is shrunk. They may change within a video."""
     is_deinterlaced: bool = False
     """Whether the picture is made of an interlaced frame."""
     alpha: Callable[[], UInt8[np.ndarray, "h w"] | None] = lambda: None
-    """Makes the alpha of the picture as it is shown, before it is shrunk; None if there is none or it is opaque."""
-    combs: Callable[[], float] = no_combs
+    """Makes the alpha before it is shrunk; None if there is none or it is opaque. It ignores the lens."""
+    combs: Callable[[], float] = lambda: 0.0
     """Measures the combs of the frame as stored, as a part of its pixels (`mien.media.fields.combs`)."""
 
 
 def probe_video(path: Path, wanted: int | None = None) -> VideoInfo:
-    """Return the frame rate, the expected number of frames, and the HDR transfer function.
-
-    Args:
-        path: path of the video.
-        wanted: index of the stream that is read; by default that of `find_streams`.
-    """
+    """Return what a video states of the stream `wanted`, by default the first one of `find_streams`."""
     with open_video(path, wanted) as (container, stream):
         fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
         if stream.duration is not None and stream.time_base is not None:
             seconds = float(stream.duration * stream.time_base)
         else:
             seconds = (container.duration or 0) / av.time_base
-        colors, order = _container_tags(path, stream)
+        colors, order = read_container_tags(path, stream.index)
         first = _first_frame(container, stream)
         hdr = colors_of(first, colors).hdr if first is not None else ""
-        has_field_pictures = first is not None and first.interlaced_frame and order.has_field_pictures
+        fields = FieldOrder(stream.codec_context.name, order)
+        has_field_pictures = first is not None and first.interlaced_frame and fields.has_field_pictures
         others = tuple(index for index in find_streams(path) if index != stream.index)
         frames = stream.frames or round(seconds * fps)
         return VideoInfo(fps, frames, hdr, has_field_pictures, stream.index, others)
 
 
-def _container_tags(path: Path, stream: VideoStream) -> tuple[Colors, FieldOrder]:
-    colors, order = read_container_tags(path, stream.index)
-    return colors, FieldOrder(stream.codec_context.name, order)
-
-
 def _first_frame(container: InputContainer, stream: VideoStream) -> av.VideoFrame | None:
-    """Return the first frame that can be decoded, or None if the beginning is damaged.
-
-    Only frames say for sure what the codec states.
-    """
+    """Return the first frame that can be decoded: only frames say for sure what the codec states."""
     with contextlib.suppress(av.error.FFmpegError, OSError):
-        for packet in itertools.islice(container.demux(stream), _MAX_PROBED):
+        for packet in itertools.islice(container.demux(stream), 100):
             with contextlib.suppress(av.error.FFmpegError):
                 for frame in packet.decode():
                     return frame
@@ -127,13 +121,9 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
 
     Pictures of the first one's shape have its size. Others keep their own.
 
-    The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.media.tone`), and
+    The file's rotation and mirror flags and its pixel aspect are applied; HDR is tone-mapped (`mien.media.colors`), and
     interlaced frames are deinterlaced, one picture for each frame (`mien.media.fields`). Damaged parts are skipped
-    with a warning.
-
-    Args:
-        path: path of the video.
-        longest_side: side in pixels to which larger pictures are shrunk (area-averaged). 0 keeps the size.
+    with a warning. Larger pictures are shrunk by areas to a `longest_side` in pixels, unless that is 0.
     """
     first: tuple[int, int] | None = None
     for frame in read_lazily(path, longest_side):
@@ -145,10 +135,7 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
 def read_lazily(
     path: Path, longest_side: int = 0, mode: Deinterlace = "auto", wanted: int | None = None
 ) -> Iterator[LazyFrame]:
-    """Yield frames as `read_video_frames` does, but convert only pictures that are requested.
-
-    The conversion is most of the work.
-    """
+    """Yield frames as `read_video_frames` does, but convert only pictures that are requested."""
     with open_video(path, wanted) as (container, stream):
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
@@ -156,9 +143,11 @@ def read_lazily(
         first: float | None = None
         latest = -interval
         aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
-        colors, order = _container_tags(path, stream)
+        colors, fields = read_container_tags(path, stream.index)
         display = Display(str(path), float(aspect) if aspect else 1.0, longest_side, colors)
-        for frame, shown, is_deinterlaced in deinterlace(_decode(path, container, stream), order, mode):
+        order = FieldOrder(stream.codec_context.name, fields)
+        decoded = deinterlace(_decode(path, container, stream), order, mode)
+        for number, (frame, shown, is_deinterlaced) in enumerate(decoded):
             if frame.pts is None or frame.time_base is None:
                 seconds = latest + interval
             else:
@@ -168,6 +157,7 @@ def read_lazily(
             # Times must increase for everything that differentiates over time, but broken files repeat them.
             latest = seconds if seconds > latest else latest + interval
             yield LazyFrame(
+                number,
                 latest,
                 partial(display.show, shown),
                 partial(display.size_of, shown),
@@ -185,25 +175,35 @@ def write_video(
     preset: str = "medium",
     sound: tuple[Path, float] | None = None,
 ) -> None:
-    """Write sRGB frames as H.264 (yuv420p, BT.709), atomically. Odd sizes get a repeated last row or column.
+    """Write sRGB frames of one size as H.264, atomically. They are read once, so a generator will do.
 
     Args:
         path: path of the video. Its ending, usually .mp4, chooses the container.
-        frames: frames of one size. They are read once, so a generator will do.
+        frames: the frames.
         fps: frames per second.
         crf: x264's constant rate factor: 0 is lossless, 18 looks lossless, 51 is worst.
         preset: x264's preset. `veryfast` takes a third of the time and compresses somewhat worse.
         sound: a file with sound for the video, and the video's length in seconds.
     """
+    # x264's macroblock tree reads memory that it has not written, so equal pictures could give different files.
+    encode(path, frames, fps, "libx264", {"crf": str(crf), "preset": preset, "mbtree": "0"}, sound)
+
+
+def encode(
+    path: Path,
+    frames: Iterable[UInt8[np.ndarray, "h w _"]],
+    fps: int | float,
+    codec: str,
+    options: dict[str, str],
+    sound: tuple[Path, float] | None = None,
+) -> None:
+    """Write RGB or RGBA frames in BT.709, 4:2:0, atomically. Odd sizes get a repeated last row or column."""
     iterator = iter(frames)
     first = next(iterator, None)
     if first is None:
         raise UserError(f"{path}: no frames to write; check the selection of frames")
-    # x264's macroblock tree reads memory that it has not written, so equal pictures could give different files.
-    options = {"crf": str(crf), "preset": preset, "mbtree": "0"}
-    write_atomically(
-        path, lambda aside: _encode(aside, itertools.chain([first], iterator), first.shape, fps, options, sound)
-    )
+    everything = itertools.chain([first], iterator)
+    write_atomically(path, lambda aside: _encode(aside, everything, first.shape, fps, codec, options, sound))
 
 
 def _encode(
@@ -211,19 +211,24 @@ def _encode(
     frames: Iterable[np.ndarray],
     shape: tuple[int, ...],
     fps: int | float,
+    codec: str,
     options: dict[str, str],
-    sound: tuple[Path, float] | None = None,
+    sound: tuple[Path, float] | None,
 ) -> None:
-    height, width = shape[:2]
+    height, width, channels = shape
+    is_h264 = codec == "libx264"
     with create_video(path) as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=options)
-        stream.width, stream.height, stream.pix_fmt = width + width % 2, height + height % 2, "yuv420p"
+        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
+        assert isinstance(stream, VideoStream)
+        stream.width, stream.height = width + width % 2, height + height % 2
+        stream.pix_fmt = "yuva420p" if channels == 4 else "yuv420p"
         context = stream.codec_context
-        context.thread_count = _THREADS
+        if is_h264:
+            context.thread_count = _THREADS
         # Players assume BT.709 for matrix, primaries and transfer, and studio range. The file also says so.
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = ColorRange.MPEG
-        packets = add_sound(container, *sound) if sound is not None else iter(())
+        packets = _add_sound(container, *sound) if sound is not None else iter(())
         heard = next(packets, None)
         reformatter = VideoReformatter()
         for number, image in enumerate(frames):
@@ -235,11 +240,11 @@ def _encode(
             assert image.dtype == np.uint8, image.dtype
             even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             frame = reformatter.reformat(
-                av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24"),
-                format="yuv420p",
+                av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgba" if channels == 4 else "rgb24"),
+                format=stream.pix_fmt,
                 dst_colorspace=Colorspace.ITU709,
                 dst_color_range=ColorRange.MPEG,
-                interpolation=ACCURATE,
+                interpolation=ACCURATE if is_h264 else None,
             )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -293,3 +298,83 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
         )
     if damaged:
         say(f"warning: {path}: {damaged} damaged parts of the video were skipped")
+
+
+RATE = 16_000
+"""Samples a second of `read_sound`."""
+_MOST_SECONDS = 3600.0
+_LEAST_RATE, _MOST_RATE = 1_000, 768_000
+"""Bounds of the samples a second of a file."""
+_WRITTEN_RATE = 48_000
+
+
+def read_sound(path: Path) -> Float32[np.ndarray, " n"]:
+    """The sound of a file as one channel, -1..1, with `RATE` samples a second."""
+    # FFmpeg would make one channel of two louder than each.
+    parts = [frame.to_ndarray().mean(0) for frame in _resampled(path, None, RATE)]
+    return np.nan_to_num(np.concatenate(parts).astype(np.float32))
+
+
+def _add_sound(container: OutputContainer, path: Path, seconds: float) -> Iterator[av.Packet]:
+    """Yield the packets (AAC) of a new stream with a file's sound. The container's other streams are there already.
+
+    Sound that is longer than the video is cut, and shorter sound is followed by silence.
+    """
+    stream = container.add_stream("aac", rate=_WRITTEN_RATE, layout="stereo")
+    stream.bit_rate = 160_000
+    samples, done = round(seconds * _WRITTEN_RATE), 0
+    for frame in (*_resampled(path, "stereo", _WRITTEN_RATE), None):
+        if done >= samples:
+            break
+        content = np.zeros((2, samples - done), np.float32) if frame is None else frame.to_ndarray()
+        content = np.ascontiguousarray(content[:, : samples - done], np.float32)
+        if content.shape[1] == 0:
+            continue
+        piece = av.AudioFrame.from_ndarray(content, format="fltp", layout="stereo")
+        piece.sample_rate, piece.time_base, piece.pts = _WRITTEN_RATE, Fraction(1, _WRITTEN_RATE), done
+        done += content.shape[1]
+        yield from stream.encode(piece)
+    yield from stream.encode()
+
+
+def _resampled(path: Path, layout: str | None, rate: int) -> Iterator[av.AudioFrame]:
+    """The decoded sound. Damaged parts after the beginning are left out."""
+    count = 0
+    with open_sound(path) as (container, stream):
+        for piece in _converted(path, _decoded(container, stream), layout, rate):
+            count += piece.samples
+            if count > _MOST_SECONDS * rate:
+                raise UserError(f"{path}: is longer than an hour; cut it into shorter files")
+            yield piece
+    if count == 0:
+        raise UserError(f"{path}: no sound of it can be decoded; convert it to .wav or record it again")
+
+
+def _decoded(container: InputContainer, stream: av.AudioStream) -> Iterator[av.AudioFrame]:
+    """The frames up to the first that cannot be decoded."""
+    with contextlib.suppress(av.error.FFmpegError, OSError):
+        yield from container.decode(stream)
+
+
+def _converted(path: Path, frames: Iterator[av.AudioFrame], layout: str | None, rate: int) -> Iterator[av.AudioFrame]:
+    """The frames in another format. The first one whose rate or channels differ from those before begins anew."""
+    resampler, kind = None, None
+    try:
+        for frame in frames:
+            if not _LEAST_RATE <= frame.sample_rate <= _MOST_RATE:
+                raise UserError(
+                    f"{path}: has {frame.sample_rate:,} samples a second, not {_LEAST_RATE:,} to {_MOST_RATE:,}; "
+                    "convert it to .wav or record it again"
+                )
+            found = (frame.sample_rate, frame.layout.name, frame.format.name)
+            if resampler is None or found != kind:
+                if resampler is not None:
+                    yield from resampler.resample(None)
+                resampler, kind = AudioResampler(format="fltp", layout=layout, rate=rate), found
+            yield from resampler.resample(frame)
+        if resampler is not None:
+            yield from resampler.resample(None)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise UserError(
+            f"{path}: its sound cannot be converted ({error}); convert it to .wav or record it again"
+        ) from None

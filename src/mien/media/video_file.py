@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -46,16 +46,9 @@ _LISTS = (
     (rb"\A\[InternetShortcut\]|\A\[playlist\]|\A<asx", "a link or a playlist"),
 )
 """Beginnings of files that name other files or addresses instead of holding pictures, and their descriptions."""
-_SNIFFED = 4096
 _ANY_TITLE: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 """Titles may have any encoding. PyAV 19 takes them as they are and no longer has the argument."""
-_BUFFER = 1 << 16
-"""Bytes that FFmpeg requests at a time."""
 _STILLS = Disposition.timed_thumbnails | Disposition.still_image
-_MOST_FPS = 1000
-"""Frames a second above which a stream of pictures is no film."""
-_COUNTED = 5000
-"""Packets in which a stream has to have two, or it counts as a still picture."""
 _AnyStream = TypeVar("_AnyStream", VideoStream, AudioStream)
 
 
@@ -70,15 +63,12 @@ class _Local:
 
 @contextmanager
 def open_video(path: Path, wanted: int | None = None) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a video file and a stream of moving pictures, ready to be decoded.
-
-    Args:
-        path: path of the file.
-        wanted: index of the stream. By default it is the first one that `find_streams` returns.
-    """
+    """Open a stream of moving pictures, by default the first one of `find_streams`, ready to be decoded."""
     with _open_container(path, "video") as container:
         stream = _moving_pictures(path, container, wanted)
-        _check_size(path, stream.codec_context.width, stream.codec_context.height)
+        width, height = stream.codec_context.width, stream.codec_context.height
+        if width * height > MAX_FRAME_PIXELS:
+            raise UserError(f"{path}: its pictures have {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
         stream.codec_context.options = {"max_pixels": str(MAX_FRAME_PIXELS)}
         yield container, stream
 
@@ -139,7 +129,7 @@ def _open_container(path: Path, kind: str, also: dict[str, str] | None = None) -
                     "protocol_whitelist": "none",
                     **(also or {}),
                 },
-                buffer_size=_BUFFER,
+                buffer_size=1 << 16,
                 **_ANY_TITLE,
             )
         except (av.error.FFmpegError, OSError) as error:
@@ -150,11 +140,7 @@ def _open_container(path: Path, kind: str, also: dict[str, str] | None = None) -
 
 @contextmanager
 def create_video(path: Path) -> Iterator[OutputContainer]:
-    """Create a video file. The ending of `path` chooses the container.
-
-    Raises:
-        OSError: the file cannot be written; it carries the system's reason.
-    """
+    """Create a video file. The ending of `path` chooses the container."""
     with path.open("wb") as file:
         local = _Local(file, f"video{path.suffix}")
         failed: list[OSError] = []
@@ -177,15 +163,10 @@ def create_video(path: Path) -> Iterator[OutputContainer]:
             raise
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
-    if width * height > MAX_FRAME_PIXELS:
-        raise UserError(f"{path}: its pictures have {width}x{height} pixels, {TOO_MANY_PIXELS}; make it smaller")
-
-
 def _why_not(path: Path, error: av.error.FFmpegError | OSError, kind: str) -> str:
     """Return what a file that FFmpeg refused is, as far as its beginning shows, and what to do."""
     with path.open("rb") as file:
-        start = file.read(_SNIFFED)
+        start = file.read(4096)
     for pattern, listed in _LISTS:
         if re.search(pattern, start):
             return f"is {listed}, which names other files; mien opens none of those: give the video itself"
@@ -205,14 +186,8 @@ def _moving_pictures(path: Path, container: InputContainer, wanted: int | None) 
     for stream in container.streams.video:
         if stream.index == wanted and stream.codec_context is not None:
             return stream
-    raise UserError(
-        f"{path}: --capture.stream {wanted} is no stream of pictures; its streams of pictures are {list_streams(known)}"
-    )
-
-
-def list_streams(streams: Sequence[VideoStream]) -> str:
-    """Return the indices and sizes of streams, for messages."""
-    return ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)
+    others = ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in known)
+    raise UserError(f"{path}: --capture.stream {wanted} is no stream of pictures; its streams of pictures are {others}")
 
 
 def _known_pictures(path: Path, container: InputContainer) -> list[VideoStream]:
@@ -239,18 +214,18 @@ def _rank(path: Path, streams: list[_AnyStream]) -> list[_AnyStream]:
     def place(stream: _AnyStream) -> tuple[bool, bool, int, int]:
         pixels = stream.width * stream.height if isinstance(stream, VideoStream) else 0
         is_still = packets[stream.index] < 2 or bool(stream.disposition & _STILLS)
-        is_odd = isinstance(stream, VideoStream) and (stream.average_rate or 0) > _MOST_FPS
+        is_odd = isinstance(stream, VideoStream) and (stream.average_rate or 0) > 1000
         return is_still or is_odd, not stream.disposition & Disposition.default, -pixels, stream.index
 
     return sorted(streams, key=place)
 
 
 def _count_packets(path: Path, indices: list[int]) -> Counter[int]:
-    """Count the packets of streams, until each has two or many of another have been read."""
+    """Count the packets of streams, until each has two, or 5,000 have been read."""
     counts: Counter[int] = Counter()
     damage = contextlib.suppress(av.error.FFmpegError, OSError)
     with _open_container(path, "video", {"codec_whitelist": "none"}) as container, damage:
-        for packet in itertools.islice(container.demux([container.streams[index] for index in indices]), _COUNTED):
+        for packet in itertools.islice(container.demux([container.streams[index] for index in indices]), 5000):
             counts[packet.stream_index] += packet.size > 0
             if all(counts[index] > 1 for index in indices):
                 break
@@ -258,10 +233,7 @@ def _count_packets(path: Path, indices: list[int]) -> Counter[int]:
 
 
 def _codec_name(container: InputContainer, index: int) -> str:
-    """Return the codec's name or four-character code, taken from FFmpeg's description.
-
-    PyAV gives neither if there is no decoder.
-    """
+    """Return the codec's name from FFmpeg's description, since PyAV gives none if there is no decoder."""
     level = av.logging.get_level()
     av.logging.set_level(av.logging.INFO)
     try:

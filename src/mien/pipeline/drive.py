@@ -13,22 +13,19 @@ from mien.avatar.files import load_avatar
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import file_digest, write_atomically
 from mien.disk.workspace import Workspace, open_workspace
-from mien.driving.drivers import Driver, read_recording, read_tracked_driver
-from mien.driving.keeping import keep_to_filmed
-from mien.driving.neutral import with_neutral
+from mien.driving.drivers import Driver, read_recording, read_tracked_driver, with_neutral
 from mien.driving.rest import facing, rest_of
-from mien.driving.transfer import drive
+from mien.driving.transfer import drive, keep_to_filmed
 from mien.face.cache import cache_folder, cache_is_kept
 from mien.face.model import FaceModel
 from mien.machine.progress import say, track_progress
-from mien.media.choices import SOUND_ENDINGS
 from mien.media.output import plan_output
 from mien.media.pictures import side_by_side
 from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.draw import draw, posed_softly, view, warn_of_white
-from mien.pipeline.driver import NEUTRALS, check_driver, check_neutral, holds_pictures, is_tracked_sequence
+from mien.pipeline.driver import NamedDriver, name_driver, name_neutral
 from mien.pipeline.names import is_picture
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.track import run_tracking_stage
@@ -53,49 +50,33 @@ def open_driver(
         sequence: Name of a sequence of the workspace. For a video with cuts: one part instead of all parts in a row.
         face_model: The avatar's face model.
         fps: Frame rate of the timecode in a csv.
-        neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.with_neutral`).
+        neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.drivers.with_neutral`).
         capture: How a film is captured.
     """
-    check_driver(by, sequence, fps, capture)
-    check_neutral(neutral)
-    driver = _open(by, sequence, face_model, fps, capture)
-    if neutral is None and by.is_file() and _is_film(by) and is_picture(by):
+    named, rest = name_driver(by, sequence, fps, capture), name_neutral(neutral)
+    driver = _open(named, face_model)
+    if neutral is None and named.kind == "film" and by.is_file() and is_picture(by):
         say(f"{by}: is one picture, so its motion is measured from the face model's neutral")
         neutral = "model"
-    other = None if neutral is None or neutral in NEUTRALS else _open(Path(neutral), None, face_model)
+    other = _open(rest, face_model) if isinstance(rest, NamedDriver) else None
     return with_neutral(driver, face_model, neutral, str(by), other)
 
 
-def _is_film(by: Path) -> bool:
-    return by.suffix.lower() not in (".csv", ".json", *SOUND_ENDINGS)
-
-
-def _open(
-    by: Path,
-    sequence: str | None,
-    face_model: FaceModel,
-    fps: float | None = None,
-    capture: CaptureSettings | None = None,
-) -> Driver:
-    if by.is_file() and not _is_film(by):
-        return read_recording(by, face_model, fps)
-    if by.is_file() or holds_pictures(by):
-        workspace, names = tracked_film(by, face_model.name, capture)
-        names = names if sequence is None else [workspace.pick_sequence(sequence)]
-    elif is_tracked_sequence(by):
-        return read_tracked_driver([by], face_model)
+def _open(named: NamedDriver, face_model: FaceModel) -> Driver:
+    if named.kind == "recording":
+        return read_recording(named.path, face_model, named.fps)
+    if named.kind == "sequence":
+        return read_tracked_driver([named.path], face_model)
+    if named.kind == "film":
+        workspace, names = tracked_film(named.path, face_model.name, named.capture)
     else:
-        workspace = open_workspace(by)
-        names = [workspace.pick_sequence(sequence)]
+        workspace, names = open_workspace(named.path), None
+    if names is None or named.sequence is not None:
+        names = [workspace.pick_sequence(named.sequence)]
     return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)
 
 
-_FEWEST = 3
-"""Least number of frames that are tracked. Fewer pictures are repeated."""
-
-
-def _write(content: bytes, path: Path) -> None:
-    path.write_bytes(content)
+_FEWEST = 3  # frames that are tracked at least. Fewer pictures are repeated
 
 
 def tracked_film(
@@ -116,7 +97,7 @@ def tracked_film(
         source = workspace.root / film.resolve().stem
         for index, picture in enumerate(each for each in pictures for _ in range(_FEWEST)):
             content = picture.read_bytes()
-            write_atomically(source / f"{index}{picture.suffix}", partial(_write, content))
+            write_atomically(source / f"{index}{picture.suffix}", partial(Path.write_bytes, data=content))
     run_capture_stage(workspace, source, None, settings)
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
     tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")

@@ -17,7 +17,7 @@ from mien import runtime
 from mien.avatar.baking import as_array
 from mien.camera import Camera
 from mien.disk.files import cannot_write
-from mien.driving.live.follower import FollowOptions
+from mien.driving.follower import FollowOptions
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.media.camera_names import CameraName

@@ -12,10 +12,9 @@ from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import load_avatar
 from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
-from mien.driving.keeping import keep_to_filmed
-from mien.driving.live.follower import Follower, FollowOptions
+from mien.driving.follower import Follower, FollowOptions
 from mien.driving.rest import facing, rest_of
-from mien.driving.transfer import drive
+from mien.driving.transfer import drive, keep_to_filmed
 from mien.errors import UserError
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel

@@ -13,7 +13,7 @@ from mien.viewer.session import Seen, Session
 
 if TYPE_CHECKING:
     from mien.capture.person.faces import LandmarkDetector
-    from mien.driving.live.follower import Follower
+    from mien.driving.follower import Follower
     from mien.media.live_camera import LiveCamera, LiveFrame
 
 STAGES = ("camera", "tracking", "drawing")

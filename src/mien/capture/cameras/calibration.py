@@ -1,21 +1,19 @@
 """Read the calibration of several cameras, and check that it fits their pictures."""
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mien.camera import Camera
-from mien.capture.store import is_file_name
-from mien.disk.inside import listed
+from mien.disk.inside import is_plain_name, listed
 from mien.errors import UserError
 from mien.media.color_correction import ColorCorrection, correction_of_entry
 from mien.media.lens import Lens, lens_of_entry
 from mien.render.camera_paths import camera_of_entry, read_camera_entries
 
-_MAX_ASPECT_ERROR = 0.01
-"""Largest relative difference between the aspect ratios of a camera and of its pictures."""
-_MAX_OFFSET = 1_000_000
+_MAX_ASPECT_ERROR = 0.01  # largest relative difference between the aspect ratios of a camera and of its pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,23 +57,14 @@ def read_calibration(path: Path) -> list[CalibratedCamera]:
     """
     entries = read_camera_entries(path, "give one entry for every camera")
     found = [_calibrated_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries)]
-    ids = [camera.camera_id for camera in found]
-    seen: set[str] = set()
-    for camera_id in ids:
-        if camera_id in seen:
+    for camera_id, count in Counter(camera.camera_id for camera in found).items():
+        if count > 1:
             raise UserError(f"{path}: two cameras have the id {camera_id!r}; give every camera its own")
-        seen.add(camera_id)
     return found
 
 
 def match_sources(sources: list[Path], cameras: list[CalibratedCamera], path: Path) -> list[Path]:
-    """Return the video or folder of pictures of every camera, in the order of the calibration.
-
-    Args:
-        sources: a video or a folder of pictures for each camera, named by its id; or one folder that holds them.
-        cameras: the cameras of the calibration.
-        path: the calibration file, for messages.
-    """
+    """Return the video or folder of pictures of each camera, named by its id. `sources` may also be their folder."""
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]
         sources = [entry for entry in listed(folder) if (entry.is_dir() or entry.is_file()) and entry != path]
@@ -100,6 +89,11 @@ def match_sources(sources: list[Path], cameras: list[CalibratedCamera], path: Pa
     return [by_id[camera.camera_id] for camera in cameras]
 
 
+def is_file_name(name: object) -> bool:
+    """Whether a camera's name can be the name of a folder on any system."""
+    return is_plain_name(name) and not set(str(name)) & set(':*?"<>|')
+
+
 def _listed(ids: set[str]) -> str:
     ordered = sorted(ids)
     return ", ".join(ordered[:6]) + (f", ... ({len(ordered)} in all)" if len(ordered) > 6 else "")
@@ -113,7 +107,7 @@ def _calibrated_camera(entry: Any, where: str) -> CalibratedCamera:
         raise UserError(
             f"{where}: {camera_id!r} cannot be an id; give a text that can be the name of a folder, such as '08'"
         )
-    if not isinstance(offset, int) or isinstance(offset, bool) or not 0 <= offset <= _MAX_OFFSET:
+    if not isinstance(offset, int) or isinstance(offset, bool) or not 0 <= offset <= 1_000_000:
         raise UserError(f"{where} ({camera_id}): offset {offset!r} is not a number of frames; give 0 or more")
     where = f"{where} ({camera_id})"
     camera = camera_of_entry(entry, where)

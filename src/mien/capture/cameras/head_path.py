@@ -19,9 +19,6 @@ _HEAD_MOST_MISS = 0.5
 agree within 0.15 (log, 11-22)."""
 _HEAD_LEAST_ANGLE = 0.03  # smallest angle between two rays that give a point, in radians
 
-_FACE_WIDTHS = (0.08, 0.35)
-"""Plausible median width of a face in metres (eyebrows to chin, as the detector's boxes go)."""
-
 
 @dataclass(frozen=True, eq=False)
 class HeadPath:
@@ -43,12 +40,9 @@ def find_head_path(
 ) -> HeadPath:
     """Find the head from its face boxes by consensus: the point that most cameras agree on, then least squares.
 
-    A box that is no face (the back of a head, a picture on the wall) therefore does not move the point.
-
-    Args:
-        boxes: left, top, right, bottom of the face in pixels of each camera's picture. NaN where there is no face.
-        cameras: the cameras, for those pictures.
-        advise: called if the cameras do not fit. It returns what to correct in all of them, or an empty text.
+    A box that is no face (the back of a head, a picture on the wall) therefore does not move the point. Boxes are left,
+    top, right, bottom in pixels of each camera's picture, NaN where there is no face. `advise` is called if the cameras
+    do not fit, and returns what to correct in all of them, or an empty text.
     """
     path = consensus(boxes, cameras)
     if not path.known.any():
@@ -74,8 +68,11 @@ def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> H
     agrees[agrees.sum(axis=1) < 2] = False
     refined = np.full_like(best, np.nan)
     for timestep in np.flatnonzero(agrees.any(axis=1)):
+        # The point with the least sum of squared distances to the rays of the cameras that agree.
         chosen = agrees[timestep]
-        refined[timestep] = _intersection(origins[chosen], directions[timestep, chosen])
+        rays = directions[timestep, chosen]
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        refined[timestep] = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, origins[chosen]))
     return HeadPath(refined, agrees)
 
 
@@ -86,16 +83,10 @@ def _sides(boxes: Float[np.ndarray, "t c 4"]) -> Float[np.ndarray, "t c"]:
 def choose_crops(
     path: HeadPath, cameras: Sequence[Camera], size: int, whole: bool
 ) -> tuple[list[Crop], tuple[int, int]]:
-    """Choose a fixed crop for every camera, all with the same size in pixels and the head at the same scale in them.
+    """Choose a fixed crop for every camera, all of one width and height (which are returned) and of one scale.
 
-    Args:
-        path: the head's path.
-        cameras: the cameras for the source pictures.
-        size: largest side of the results in pixels. The smallest crop limits it, since none is enlarged.
-        whole: whether to take whole pictures. That is also done if all of them are head crops already.
-
-    Returns:
-        The crops, and the width and height that all of them have.
+    `size` is their largest side in pixels; the smallest crop limits it, since none is enlarged. Whole pictures are also
+    taken if all of them are head crops already.
     """
     spans = [_span(path, camera) for camera in cameras]
     sides = [max(span[2] - span[0], span[3] - span[1]) for span in spans]
@@ -167,16 +158,12 @@ def _nearest_point(
     return np.where(usable[:, None], points, np.nan)
 
 
-def _intersection(origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 3"]:
-    """The point with the least sum of squared distances to the rays."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, origins))
-
-
 def _misses(
-    points: Float[np.ndarray, "t 3"], centers: Float[np.ndarray, "t c 2"], sides: Float[np.ndarray, "t c"],
+    points: Float[np.ndarray, "t 3"],
+    centers: Float[np.ndarray, "t c 2"],
+    sides: Float[np.ndarray, "t c"],
     cameras: Sequence[Camera],
-) -> Float[np.ndarray, "t c"]:  # fmt: skip
+) -> Float[np.ndarray, "t c"]:
     """Distance of the projected point from each found face, in sides of its box; infinite where there is none."""
     projected = np.stack([project(points, camera) for camera in cameras], axis=1)
     with np.errstate(invalid="ignore"):
@@ -213,8 +200,7 @@ def _check_unit(
         depth = path.centers[chosen] @ camera.viewmat[2, :3].numpy() + float(camera.viewmat[2, 3])
         widths.append(sides[chosen, index] * depth / float(camera.K[0, 0]))
     width = float(np.median(np.concatenate(widths)))
-    least, most = _FACE_WIDTHS
-    if not least <= width <= most:
+    if not 0.08 <= width <= 0.35:  # metres, from eyebrows to chin as the detector's boxes go
         meters = f"give positions in metres (multiply the last column of every viewmat by {0.15 / width:.3g})"
         raise UserError(
             f"--calibration: according to these cameras the face is {width:.3g} m wide, but it should be about 0.15; "

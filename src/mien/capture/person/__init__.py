@@ -1,5 +1,5 @@
-"""The person in front of the camera: `survey` and `faces` find all faces, `people` and `same_person` whom to follow.
+"""The person in front of the camera: `survey` and `faces` find all faces, `people` says whom to follow and who is who.
 
-`crop` frames the head; `matte`, `plate`, `screen` and `matte_owner` say which pixels are the person's; `given` is
-what the user brings.
+`crop` frames the head; `matte` and `plate` say which pixels are the person's; `given` is what the user brings, and
+`backend` chooses the library that runs the networks.
 """

@@ -55,11 +55,8 @@ def whole_picture(width: int, height: int, size: int) -> Crop:
 def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: int) -> Crop:
     """Return a square inside the picture that holds the head over the whole clip, or the picture if it is a head crop.
 
-    Args:
-        boxes: left, top, right, bottom of the face as fractions of the picture. NaN where there is no face.
-        width: width of the source picture in pixels.
-        height: height of the source picture in pixels.
-        size: largest side of the result in pixels. Smaller crops are not enlarged.
+    Boxes are left, top, right, bottom of the face as fractions of the picture, NaN where there is none. `size` is the
+    largest side of the result in pixels; smaller crops are not enlarged.
     """
     pixels = boxes[np.isfinite(boxes).all(axis=1)] * np.array([width, height, width, height])
     assert len(pixels) > 0

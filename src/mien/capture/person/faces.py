@@ -6,13 +6,11 @@ The classes here are seams: behind them, mediapipe or `mien.capture.person.liter
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mien.capture.person.backend import DetectorChoice, choose_detector
-from mien.capture.person.quiet_mediapipe import load_solution, quiet_mediapipe
+from mien.capture.person.backend import DetectorChoice, Networks, load_solution, quiet_mediapipe
 
 _FACE_CONFIDENCE = 0.5  # least score of a found face. MediaPipe's default
 
@@ -25,27 +23,11 @@ _Boxes = tuple[np.ndarray, np.ndarray]
 """Boxes [n, 4] as fractions of the picture, and their scores [n]."""
 
 
-class FaceFinder:
-    """Finds the boxes of all faces in a picture.
+class FaceFinder(Networks):
+    """Finds the boxes of all faces in a picture, by MediaPipe's network for near faces or else by that for far ones."""
 
-    It uses MediaPipe's detector for near faces and, if that finds none, the one for far faces.
-
-    Use as a context manager.
-    """
-
-    def __init__(self, detector: DetectorChoice = "auto") -> None:
-        self._detector: DetectorChoice = detector
-
-    def __enter__(self) -> "FaceFinder":
-        self._stack = ExitStack()
-        is_mediapipe = choose_detector(self._detector) == "mediapipe"
-        self._finds = _mediapipe_boxes(self._stack) if is_mediapipe else _litert_boxes()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._stack.close()
+    def _open(self, by_mediapipe: bool) -> None:
+        self._finds = _mediapipe_boxes(self._stack) if by_mediapipe else _litert_boxes()
 
     def find(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
         """Return left, top, right, bottom of each face (eyebrows to chin) as fractions of the picture's size."""
@@ -84,7 +66,7 @@ def _mediapipe_boxes(stack: ExitStack) -> list[Callable[[np.ndarray], _Boxes]]:
 
 
 def _litert_boxes() -> list[Callable[[np.ndarray], _Boxes]]:
-    from mien.capture.person.litert.boxes import BoxNetwork
+    from mien.capture.person.litert import BoxNetwork
 
     def of(network: BoxNetwork) -> Callable[[np.ndarray], _Boxes]:
         def find(image: np.ndarray) -> _Boxes:
@@ -96,34 +78,19 @@ def _litert_boxes() -> list[Callable[[np.ndarray], _Boxes]]:
     return [of(BoxNetwork("near_faces", _FACE_CONFIDENCE)), of(BoxNetwork("far_faces", _FACE_CONFIDENCE))]
 
 
-class MeshReader:
-    """Finds face-mesh landmarks, of single pictures or of consecutive ones. Use as a context manager."""
+class MeshReader(Networks):
+    """Finds landmarks of up to `most_faces` faces. In consecutive pictures (`is_video`), faces are followed."""
 
     def __init__(self, most_faces: int, is_video: bool, detector: DetectorChoice = "auto") -> None:
-        """Prepare.
-
-        Args:
-            most_faces: most faces that are found in a picture.
-            is_video: whether pictures are consecutive, so that faces are followed.
-            detector: what runs the networks.
-        """
+        super().__init__(detector)
         self._most, self._is_video = most_faces, is_video
-        self._detector: DetectorChoice = detector
 
-    def __enter__(self) -> "MeshReader":
-        self._stack = ExitStack()
-        is_mediapipe = choose_detector(self._detector) == "mediapipe"
-        self.read = self._mediapipe() if is_mediapipe else self._litert()
+    def _open(self, by_mediapipe: bool) -> None:
+        self.read = self._mediapipe() if by_mediapipe else self._litert()
         """Returns the landmarks [n, 478, 3] of a picture's faces in pixels; z points away from the camera."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._stack.close()
 
     def _litert(self) -> Callable[[np.ndarray], np.ndarray]:
-        from mien.capture.person.litert.mesh import Mesh
+        from mien.capture.person.litert import Mesh
 
         return Mesh(self._most, self._is_video).find
 
@@ -154,28 +121,19 @@ class MeshReader:
         return read
 
 
-class LandmarkDetector:
-    """Finds face-mesh landmarks in consecutive pictures of one clip. Use as a context manager, one for each clip.
+class LandmarkDetector(MeshReader):
+    """Finds face-mesh landmarks in consecutive pictures of one clip. Use one for each clip.
 
     The region of interest is placed by the landmarks of the previous picture. That is steadier than a new detection,
     but a result then depends on about four earlier pictures: pass those first.
     """
 
     def __init__(self, several_faces: bool, detector: DetectorChoice = "auto") -> None:
-        self._mesh = MeshReader(MAX_FACES if several_faces else 1, True, detector)
-
-    def __enter__(self) -> "LandmarkDetector":
-        self._mesh.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._mesh.__exit__(kind, error, traceback)
+        super().__init__(MAX_FACES if several_faces else 1, True, detector)
 
     def detect(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n l 2"]:
         """Return the landmarks of all faces in the next picture of the clip, in pixels."""
-        return self._mesh.read(image)[..., :2]
+        return self.read(image)[..., :2]
 
 
 def second_difference_jitter(landmarks: Float[np.ndarray, "t l 2"]) -> float:

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from mien.capture.person.crop import Crop, whole_picture
 from mien.capture.person.faces import LANDMARKS
-from mien.capture.settings import CaptureSettings
 from mien.disk.files import read_arrays
 from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import open_ordinary
@@ -23,11 +22,7 @@ from mien.media.decoding import decode_picture
 from mien.media.lens import Lens
 from mien.media.source import FrameSelection, FrameSource, list_images, open_source, read_image
 
-_MAX_LINE = 2 * LANDMARKS * 64
-"""Most characters of a csv line: more than a number of any precision takes."""
-_SPARE_BYTES = 1 << 20
-_MAX_SHOWN = 40
-"""Characters of a csv cell that a message shows."""
+_MAX_LINE = 2 * LANDMARKS * 64  # characters of a csv line: more than a number of any precision takes
 
 
 class GivenMattes:
@@ -40,27 +35,13 @@ class GivenMattes:
         lens: Lens | None = None,
         own: FrameSource | None = None,
     ) -> None:
-        """Prepare to read mattes.
-
-        Args:
-            path: a video or a folder of pictures.
-            picture_size: width and height in pixels of the source's pictures.
-            lens: lens whose distortion is taken out.
-            own: the source itself, if its alpha is the matte.
-        """
+        """Prepare to read a video or a folder. `own` is the source itself, if its alpha is the matte."""
         self._path, self._lens = path, lens
         self._size, self._is_own = picture_size, own is not None
         self._files = list_images(path) if own is None and path.is_dir() else None
         whole = FrameSelection()
         source = replace(own, selection=whole, lens=None) if own else None
         self._stream = iter(()) if self._files else (source or open_source(path, whole, 25.0)).frames()
-
-    def check(self, number: int) -> None:
-        """Read one matte, to find mistakes before anything that takes long.
-
-        Nothing can be read from this object afterwards.
-        """
-        self.matte(number, whole_picture(*self._size, max(self._size)))
 
     def matte(self, number: int, crop: Crop) -> UInt8[np.ndarray, "h w"]:
         """Return the matte of the source's frame `number`, cropped like its picture. Numbers must increase."""
@@ -93,43 +74,44 @@ class GivenInputs:
     """Positions in pixels of the source's pictures (straightened, if a lens is known), a row for each frame."""
 
 
-def read_given(settings: CaptureSettings, frames: FrameSource) -> GivenInputs:
+def read_given(frames: FrameSource, plate: Path | None, mattes: Path | None, landmarks: Path | None) -> GivenInputs:
     """Read and check what the user gave besides the source, before anything that takes long.
 
     It belongs to the pictures as they were filmed, so it is straightened like them, and the clean plate's colours are
     corrected like theirs.
     """
-    if settings.clean_plate is None and settings.mattes is None and settings.landmarks is None:
+    if plate is None and mattes is None and landmarks is None:
         return GivenInputs()
     first = next(frames.frames())
     height, width = first.picture().shape[:2]
-    plate, mattes, landmarks = None, None, None
-    if settings.clean_plate is not None:
-        plate = read_image(settings.clean_plate)
-        if plate.shape[:2] != (height, width):
+    given = GivenInputs()
+    if plate is not None:
+        scene = read_image(plate)
+        if scene.shape[:2] != (height, width):
             raise UserError(
-                f"--capture.clean-plate {settings.clean_plate}: is {plate.shape[1]}x{plate.shape[0]}, but the video's "
+                f"--capture.clean-plate {plate}: is {scene.shape[1]}x{scene.shape[0]}, but the video's "
                 f"pictures are {width}x{height}; give a picture from the same camera in the same mode"
             )
-        plate = frames.calibrated(plate)
-    if settings.mattes is not None:
-        check_mattes(settings.mattes, frames)
-        GivenMattes(settings.mattes, (width, height)).check(first.number)
-        mattes = GivenMattes(settings.mattes, (width, height), frames.lens)
-    if settings.landmarks is not None:
-        landmarks = read_landmarks(settings.landmarks, frames.count())
-        landmarks = landmarks if frames.lens is None else frames.lens.straighten_points(landmarks, width, height)
-    return GivenInputs(plate, mattes, landmarks)
+        given = replace(given, plate=frames.calibrated(scene))
+    if mattes is not None:
+        count, expected = open_source(mattes, FrameSelection(), 25.0).count(), frames.count()
+        if count != expected:
+            raise UserError(
+                f"{mattes}: has {counted(count, 'matte')}, but {frames.path} has {counted(expected, 'frame')}; "
+                "give one matte for each frame"
+            )
+        # A first one is read to find mistakes before anything that takes long.
+        GivenMattes(mattes, (width, height)).matte(first.number, whole_picture(width, height, max(width, height)))
+        given = replace(given, mattes=GivenMattes(mattes, (width, height), frames.lens))
+    if landmarks is not None:
+        points = read_landmarks(landmarks, frames.count())
+        points = points if frames.lens is None else frames.lens.straighten_points(points, width, height)
+        given = replace(given, landmarks=points)
+    return given
 
 
 def with_own_alpha(given: GivenInputs, frames: FrameSource, transparent: Bool[np.ndarray, " t"]) -> GivenInputs:
-    """Return the inputs with the source's alpha as mattes, if most of its pictures have some and no mattes are given.
-
-    Args:
-        given: what the user gave besides the source.
-        frames: the source.
-        transparent: its pictures with alpha that is not opaque.
-    """
+    """Return the inputs with the source's alpha as mattes, if most of its pictures have some and none are given."""
     opaque = int((~transparent).sum())
     if given.mattes is not None or 2 * opaque > len(transparent):
         return given
@@ -180,7 +162,7 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
 
 def _check_size(path: Path, frames: int) -> None:
     """Refuse a file that is far larger than the landmarks of a number of frames, before it is read."""
-    most = _SPARE_BYTES + 2 * frames * LANDMARKS * 2 * np.dtype(np.float64).itemsize
+    most = (1 << 20) + 2 * frames * LANDMARKS * 2 * np.dtype(np.float64).itemsize
     size = path.stat().st_size if path.is_file() else 0
     if size > most:
         raise UserError(
@@ -190,14 +172,12 @@ def _check_size(path: Path, frames: int) -> None:
 
 
 def _read_csv(path: Path, most: int) -> np.ndarray:
-    """Read the rows of the file.
-
-    At most one row beyond `most` is read, which is enough to see that there are too many.
-    """
+    """Read the rows, at most one beyond `most`, which is enough to see that there are too many."""
     rows: list[np.ndarray] = []
     try:
         for index, (number, line) in enumerate(split_lines(open_ordinary(path), _MAX_LINE)):
-            if index == 0 and any(_is_name(cell) for cell in line):
+            words = (cell.strip().lower() for cell in line)
+            if index == 0 and any(word[:1].isalpha() and word != "nan" for word in words):
                 continue
             if len(line) not in (0, 2 * LANDMARKS):
                 raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
@@ -210,27 +190,12 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
     return np.array(rows).reshape(len(rows), LANDMARKS, 2)
 
 
-def _is_name(cell: str) -> bool:
-    return cell.strip()[:1].isalpha() and cell.strip().lower() != "nan"
-
-
 def _number(path: Path, line: int, cell: str) -> float:
     try:
         return float(with_point(cell)) if cell.strip() else np.nan
     except ValueError:
-        shown = repr(cell if len(cell) <= _MAX_SHOWN else f"{cell[:_MAX_SHOWN]}...")
+        shown = repr(cell if len(cell) <= 40 else f"{cell[:40]}...")
         raise UserError(f"{path}: line {line}: {shown} is not a number; write pixels, or nan for no face") from None
-
-
-def check_mattes(path: Path, source: FrameSource) -> None:
-    """Refuse mattes whose number differs from that of the source's frames."""
-    found = open_source(path, FrameSelection(), 25.0).count()
-    expected = source.count()
-    if found != expected:
-        raise UserError(
-            f"{path}: has {counted(found, 'matte')}, but {source.path} has {counted(expected, 'frame')}; "
-            "give one matte for each frame"
-        )
 
 
 def _read_matte(path: Path) -> UInt8[np.ndarray, "h w"]:

@@ -3,22 +3,18 @@
 The segmentation is MediaPipe's network at 256x256, stabilised over time and refined at the picture's full size.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from types import TracebackType
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
-from mien.capture.person.backend import DetectorChoice, choose_detector
+from mien.capture.person.backend import DetectorChoice, Networks, load_solution, quiet_mediapipe
 from mien.capture.person.crop import Crop
 from mien.capture.person.given import GivenMattes
-from mien.capture.person.plate import plate_matte
-from mien.capture.person.quiet_mediapipe import load_solution, quiet_mediapipe
-from mien.capture.person.screen import screen_matte, screen_of
+from mien.capture.person.plate import plate_matte, screen_matte, screen_of
 
 _MATTE_STEADINESS = 0.7  # weight of the previous mask where the picture has not changed at all
 _MATTE_CHANGE = 0.03  # colour difference (0..1) at which that weight has dropped to 1 / e
@@ -32,30 +28,20 @@ eye with the next: together they remove the halo and keep curls (log)."""
 _MATTE_ALPHA_LEVELS = (0.08, 0.92)
 """Filtered values that become 0 and 1. Without this the filter's overshoot would leave a veil and holes."""
 
-_MODEL_SIZE = 256
+_MODEL_SIZE = 256  # side in pixels of the network's input
 
 
-class Segmenter:
-    """Computes soft person masks of consecutive pictures of one clip. Use as a context manager."""
+class Segmenter(Networks):
+    """Computes soft person masks of consecutive pictures of one clip."""
 
-    def __init__(self, detector: DetectorChoice = "auto") -> None:
-        self._detector: DetectorChoice = detector
-
-    def __enter__(self) -> "Segmenter":
-        self._stack = ExitStack()
-        if choose_detector(self._detector) == "litert":
-            from mien.capture.person.litert.person import PersonNetwork
-
-            self._find = PersonNetwork().find
-        else:
+    def _open(self, by_mediapipe: bool) -> None:
+        if by_mediapipe:
             self._find = _mediapipe_person(self._stack)
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
-        return self
+        else:
+            from mien.capture.person.litert import Network, find_person
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._stack.close()
+            self._find = partial(find_person, Network("person"))
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     def segment(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "256 256"]:
         """Return the probability of a person in each part of the picture, 0..1, stabilised by the previous one."""
@@ -145,57 +131,12 @@ def _affine_fit(
     return mean(slope), mean(offset)
 
 
-def _screen_or_edges(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    screen = screen_of(image)
-    return refine_matte(image, mask) if screen is None else screen_matte(image, mask, screen)
-
-
 MakeMatte = Callable[[], UInt8[np.ndarray, "h w"]]
 """Computes a matte; the caller chooses when and on which thread."""
 
 
-class Matting(ABC):
-    """Makes the mattes of consecutive cropped pictures."""
-
-    @abstractmethod
-    def warm_up(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Process a picture that only prepares the state for the next ones."""
-
-    @abstractmethod
-    def prepare(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> MakeMatte:
-        """Return a function that makes the matte of the next picture, which is the source's frame `number`."""
-
-
-class SegmentedMattes(Matting):
-    """The network's mask, refined to the picture's size by `refine(picture, mask)`."""
-
-    def __init__(self, segmenter: Segmenter, refine: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
-        self._segmenter = segmenter
-        self._refine = refine
-
-    def warm_up(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Update the state that stabilises the next masks."""
-        self._segmenter.segment(image)
-
-    def prepare(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> MakeMatte:
-        """Segment now and refine later."""
-        return partial(self._refine, image, self._segmenter.segment(image))
-
-
-class ReadMattes(Matting):
-    """Mattes that are read from files."""
-
-    def __init__(self, mattes: GivenMattes, crop: Crop) -> None:
-        self._mattes = mattes
-        self._crop = crop
-
-    def warm_up(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Do nothing: there is no state."""
-
-    def prepare(self, number: int, image: UInt8[np.ndarray, "h w 3"]) -> MakeMatte:
-        """Read the matte now."""
-        matte = self._mattes.matte(number, self._crop)
-        return lambda: matte
+PrepareMatte = Callable[[int, UInt8[np.ndarray, "h w 3"]], MakeMatte]
+"""Returns what makes the matte of the next cropped picture, which is the source's frame of that number."""
 
 
 def choose_matting(
@@ -204,10 +145,103 @@ def choose_matting(
     plate: UInt8[np.ndarray, "h w 3"] | None,
     mattes: GivenMattes | None,
     detector: DetectorChoice = "auto",
-) -> Matting:
+) -> PrepareMatte:
     """Return the matting that the user's inputs allow. `stack` closes whatever is opened."""
     if mattes is not None:
-        return ReadMattes(mattes, crop)
+
+        def read(number: int, image: np.ndarray) -> MakeMatte:
+            matte = mattes.matte(number, crop)
+            return lambda: matte
+
+        return read
     segmenter = stack.enter_context(Segmenter(detector))
-    refine = _screen_or_edges if plate is None else partial(plate_matte, plate=crop.apply(plate))
-    return SegmentedMattes(segmenter, refine)
+    scene = None if plate is None else crop.apply(plate)
+
+    def refine(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        if scene is not None:
+            return plate_matte(image, mask, scene)
+        screen = screen_of(image)
+        return refine_matte(image, mask) if screen is None else screen_matte(image, mask, screen)
+
+    return lambda number, image: partial(refine, image, segmenter.segment(image))
+
+
+_MATTE_APART_DISTANCE = 0.02
+"""Distance from the person, as a fraction of the longer side, from which a region of the matte is not theirs. Set by
+eye on d14 and s18, with the next two."""
+_MATTE_APART_MOST_AREA = 0.25
+"""Area of such a region, in areas of the person's, up to which it goes: shoulders below a covered neck stay."""
+_MATTE_BRIDGE = 0.008
+"""Half of the width of what does not join two regions, in longer sides: ends of hair reach to d14's bottle."""
+
+
+def without_others(
+    matte: UInt8[np.ndarray, "h w"], face: Float[np.ndarray, " 4"], others: Float[np.ndarray, "f 4"]
+) -> UInt8[np.ndarray, "h w"]:
+    """Return the matte of the person whose face has this box.
+
+    A region that is apart from the person's goes if it has another face, or is small and far from the person. Where
+    people touch, each pixel belongs to the face that is nearer, in units of the faces' sides. Boxes are left, top,
+    right, bottom in pixels; rows of NaN in `others` are none.
+    """
+    radius = round(_MATTE_BRIDGE * max(matte.shape))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    # Regions are of pixels that are half opaque, without what is narrower than a bridge: ends of hair reach to things
+    # behind them. Softer pixels belong to the nearest region.
+    solid = cv2.erode((matte >= 128).astype(np.uint8), kernel)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid)
+    regions, areas = labels.astype(np.intp), np.asarray(stats)[:, cv2.CC_STAT_AREA]
+    own, touching, gone = _region_in(regions, face), [], np.zeros(count, bool)
+    if own == 0:
+        return matte
+    for box in others[np.isfinite(others[:, 0])]:
+        region = _region_in(regions, box)
+        if region == own:
+            touching.append(box)
+        gone[region] = True
+    if count > 2:
+        distances = cv2.distanceTransform((regions != own).astype(np.uint8), cv2.DIST_L2, 3)
+        nearest = np.full(count, np.inf)
+        np.minimum.at(nearest, regions.ravel(), np.asarray(distances).ravel())
+        is_small = areas < _MATTE_APART_MOST_AREA * areas[own]
+        gone |= is_small & (nearest > _MATTE_APART_DISTANCE * max(matte.shape))
+    gone[[0, own]] = False
+    taken = gone[regions]
+    if touching:
+        taken |= (regions == own) & (_distance(matte.shape, touching) < _distance(matte.shape, [face]))
+    if not taken.any():
+        return matte
+    keeps = (regions > 0) & ~taken
+    to_kept, to_taken = (cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3) for mask in (keeps, taken))
+    return np.where(np.asarray(to_kept) <= np.asarray(to_taken), matte, 0).astype(np.uint8)
+
+
+def held(others: Float[np.ndarray, "t f 4"], frames: int) -> Float[np.ndarray, "t g 4"]:
+    """Return other faces' boxes where each also counts in so many frames before and after, in which it was missed."""
+    seen = np.flatnonzero(np.isfinite(others[..., 0]).any(axis=1))
+    result = others.copy()
+    if len(seen):
+        nearest = seen[np.abs(np.arange(len(others))[:, None] - seen).argmin(axis=1)]
+        is_near = np.abs(nearest - np.arange(len(others))) <= frames
+        result[is_near] = others[nearest[is_near]]
+    return result
+
+
+def _region_in(regions: Int[np.ndarray, "h w"], box: Float[np.ndarray, " 4"]) -> int:
+    """Return the region that fills at least half of a box, or 0."""
+    left, top, right, bottom = np.clip(np.rint(box), 0, [*regions.shape[::-1], *regions.shape[::-1]]).astype(int)
+    inside = np.bincount(regions[top:bottom, left:right].ravel(), minlength=1)
+    return int(inside.argmax()) if inside.max() * 2 >= max(inside.sum(), 1) else 0
+
+
+def _distance(shape: tuple[int, ...], boxes: Sequence[Float[np.ndarray, " 4"]]) -> Float[np.ndarray, "h w"]:
+    """Return the distance of each pixel from the nearest face's middle, in sides of that face."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    sides = [max(float(np.sqrt((box[2] - box[0]) * (box[3] - box[1]))), 1.0) for box in boxes]
+    return np.min(
+        [
+            np.hypot(x - (box[0] + box[2]) / 2, y - (box[1] + box[3]) / 2) / side
+            for box, side in zip(boxes, sides, strict=True)
+        ],
+        axis=0,
+    )

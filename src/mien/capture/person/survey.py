@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,23 +21,17 @@ from mien.disk.files import expect_whole, read_arrays, write_arrays
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import same_shape
-from mien.media.source import FrameSource, SourceFrame
+from mien.media.source import FrameSource
+from mien.media.video import LazyFrame
 
 _CUT_THUMBNAIL = (32, 18)
 """Width and height in pixels of the thumbnails that are compared, whatever the picture's shape."""
 _PERSON_COLOR_CELLS = 3  # cells along each side of the grid on which a face's mean colours are computed
 _SURVEY_SIDE = 512  # longest side in pixels of the pictures in which faces are searched
 
-_CHUNK = 1000
-"""Frames after which progress is saved."""
-_COMB_STRIDE = 5
-"""Combs are measured in every fifth frame."""
-_STORED_NAMES = {"colors": "looks"}
-"""Names of arrays in the file, if they differ from the names of the fields."""
-_MAX_TURNED = 8
-"""Most pictures that are turned each way..."""
-_BEGINNING = 500
-"""...taken from this many at the beginning, preferably with a face."""
+_CHUNK = 1000  # frames after which progress is saved
+_MAX_TURNED = 8  # most pictures that are turned each way...
+_BEGINNING = 500  # ...taken from this many at the beginning, preferably with a face
 _MIN_GAIN = 0.06
 """Smallest mean gain in confidence (0..1) by turning the pictures. In four clips, upright faces had 0.10 to 0.13 more
 than the same faces lying on their side, and at least 0.15 more than upside down."""
@@ -85,12 +80,7 @@ def survey_source(
 ) -> Survey:
     """Survey all frames. Results that an earlier call left in the folder `work` are kept.
 
-    Args:
-        frames: the source.
-        work: the folder for the results.
-        landmarks: landmarks for every frame of the source in pixels, NaN for no face. If they are given, faces are not
-            searched.
-        detector: what runs the networks.
+    If landmarks are given for every frame of the source, in pixels and NaN for no face, faces are not searched.
     """
     work.mkdir(parents=True, exist_ok=True)
     whole, done = work / "survey.safetensors", []
@@ -101,37 +91,31 @@ def survey_source(
     stream = itertools.islice(frames.frames(_SURVEY_SIDE), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
     with ExitStack() as stack:
-        find = _search(stack.enter_context(FaceFinder(detector))) if landmarks is None else _look_up(landmarks)
+        finder = stack.enter_context(FaceFinder(detector)) if landmarks is None else None
+
+        def find(frame: LazyFrame, image: np.ndarray) -> np.ndarray:
+            if finder is not None:
+                return finder.find(image)
+            assert landmarks is not None
+            return _boxes_of(landmarks, frame)
+
         advance = stack.enter_context(progress_bar(title, frames.expected_frames, len(done) * _CHUNK))
         while seen := _observe(itertools.islice(stream, _CHUNK), find, advance):
-            _write(_chunk_path(work, len(done)), seen)
+            write_arrays(_chunk_path(work, len(done)), vars(seen))
             done.append(seen)
-    survey = _join(done)
-    _write(whole, survey)
+    names = [field.name for field in fields(Survey)]
+    survey = Survey(**{name: np.concatenate([getattr(chunk, name) for chunk in done]) for name in names})
+    write_arrays(whole, vars(survey))
     for index in range(len(done)):
         _chunk_path(work, index).unlink()
     return survey
 
 
-def _write(path: Path, survey: Survey) -> None:
-    write_arrays(path, {_STORED_NAMES.get(name, name): array for name, array in vars(survey).items()})
-
-
 def _read(path: Path) -> Survey:
     """Read the saved results of an earlier call."""
     arrays = read_arrays(path)
-    t, side, colors = len(arrays.get("numbers", ())), _CUT_THUMBNAIL[::-1], 3 * _PERSON_COLOR_CELLS**2
-    kinds = {
-        "numbers": ((t,), np.int64), "timestamps": ((t,), np.float64), "boxes": ((t, MAX_FACES, 4), np.float64),
-        "looks": ((t, MAX_FACES, colors), np.float64), "thumbnails": ((t, *side, 3), np.uint8),
-        "deinterlaced": ((t,), np.bool_), "combs": ((t,), np.float64), "transparent": ((t,), np.bool_),
-        "sizes": ((t, 2), np.int64),
-    }  # fmt: skip
     with expect_whole(path, "delete its folder and run `mien capture` again"):
-        for name, (shape, dtype) in kinds.items():
-            if arrays[name].shape != shape or arrays[name].dtype != dtype or t == 0:
-                raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}")
-        return Survey(**{field.name: arrays[_STORED_NAMES.get(field.name, field.name)] for field in fields(Survey)})
+        return Survey(**arrays)
 
 
 def slice_survey(survey: Survey, span: slice) -> Survey:
@@ -139,29 +123,20 @@ def slice_survey(survey: Survey, span: slice) -> Survey:
     return Survey(**{field.name: getattr(survey, field.name)[span] for field in fields(survey)})
 
 
-_Find = Callable[[SourceFrame, np.ndarray], np.ndarray]
+_Find = Callable[[LazyFrame, np.ndarray], np.ndarray]
 """Returns the boxes [n, 4] of the faces in a frame, given the frame and its picture."""
 
 
-def _search(finder: FaceFinder) -> _Find:
-    return lambda frame, image: finder.find(image)
+def _boxes_of(landmarks: Float[np.ndarray, "n l 2"], frame: LazyFrame) -> Float[np.ndarray, "n 4"]:
+    """Return the box around landmarks that are given in pixels, or none."""
+    face = landmarks[frame.number] / frame.size()
+    box = np.concatenate([face.min(axis=0), face.max(axis=0)])
+    return box[None] if np.isfinite(face).all() else np.zeros((0, 4))
 
 
-def _look_up(landmarks: Float[np.ndarray, "n l 2"]) -> _Find:
-    """Return boxes around landmarks that are given in pixels."""
-
-    def find(frame: SourceFrame, image: np.ndarray) -> np.ndarray:
-        face = landmarks[frame.number] / frame.size()
-        return (
-            np.concatenate([face.min(axis=0), face.max(axis=0)])[None] if np.isfinite(face).all() else np.zeros((0, 4))
-        )
-
-    return find
-
-
-def _observe(stream: Iterator[SourceFrame], find: _Find, advance: Advance) -> Survey | None:
+def _observe(stream: Iterator[LazyFrame], find: _Find, advance: Advance) -> Survey | None:
     """Survey the frames of a stream; None if it is at its end."""
-    rows: list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray, bool, float, bool, tuple[int, int]]] = []
+    rows: list[tuple[Any, ...]] = []
     for frame in stream:
         image = frame.picture()
         found = find(frame, image)
@@ -170,17 +145,14 @@ def _observe(stream: Iterator[SourceFrame], find: _Find, advance: Advance) -> Su
         boxes[: len(largest)] = found[largest]
         colors = np.stack([_mean_colors(image, box) for box in boxes])
         thumbnail = cv2.resize(image, _CUT_THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-        measured = frame.combs() if len(rows) % _COMB_STRIDE == 0 else np.nan
-        seen = frame.is_deinterlaced, measured, frame.alpha() is not None, frame.size()
+        combs = frame.combs() if len(rows) % 5 == 0 else np.nan
+        seen = frame.is_deinterlaced, combs, frame.alpha() is not None, frame.size()
         rows.append((frame.number, frame.seconds, boxes, colors, thumbnail, *seen))
         advance()
     if not rows:
         return None
-    numbers, timestamps, boxes, colors, thumbnails, deinterlaced, combs, transparent, sizes = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
-    whole = numbers.astype(np.int64), sizes.astype(np.int64)
-    return Survey(whole[0], timestamps, boxes, colors, thumbnails, deinterlaced, combs, transparent, whole[1])
+    columns = dict(zip((field.name for field in fields(Survey)), map(np.array, zip(*rows, strict=True)), strict=True))
+    return Survey(**{**columns, **{name: columns[name].astype(np.int64) for name in ("numbers", "sizes")}})
 
 
 def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
@@ -200,20 +172,8 @@ def _chunk_path(work: Path, index: int) -> Path:
     return work / f"survey-{index:04d}.safetensors"
 
 
-def _join(chunks: list[Survey]) -> Survey:
-    names = [field.name for field in fields(Survey)]
-    return Survey(**{name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names})
-
-
 def check_upright(frames: FrameSource, survey: Survey, turned: int, detector: DetectorChoice = "auto") -> None:
-    """Warn if faces lie on their side, and refuse a video without a face.
-
-    Args:
-        frames: the source.
-        survey: the source's survey.
-        turned: degrees by which the pictures have been turned already.
-        detector: what runs the networks.
-    """
+    """Warn if faces lie on their side after a turn by some degrees, and refuse a video without a face."""
     turn = _best_turn(frames, survey, detector)
     option = f"--capture.turn {(turned + turn) % 360}"
     if not np.isfinite(survey.boxes).any():
@@ -247,7 +207,7 @@ def no_face(path: Path, frames: int, remedy: str = "give a video that shows a fa
 
 def _stream_with_face(frames: FrameSource, detector: DetectorChoice) -> int | None:
     """Return the first of the file's other streams that shows a face in some pictures at its beginning."""
-    for stream in frames.other_streams:
+    for stream in frames.video.other_streams:
         other, stride = replace(frames, stream=stream), _BEGINNING // _MAX_TURNED
         pictures = itertools.islice(other.frames(_SURVEY_SIDE), 0, _BEGINNING, stride)
         with FaceFinder(detector) as finder, contextlib.suppress(UserError):
@@ -269,3 +229,55 @@ def _no_face_because(frames: FrameSource, survey: Survey, option: str, detector:
     if level > _MAX_LEVEL:
         return no_face(path, count, f"it is over-exposed (mean level {level:.0%}): film again with less exposure")
     return no_face(path, count)
+
+
+_MIN_COMBS = 0.004
+"""Part of the picture with combs (`mien.media.fields.combs`) from which a video counts as interlaced. Seven
+progressive clips have at most 0.0008, with noise of 8 levels 0.0027. Woven from two frames each, they have 0.0066."""
+
+
+def tell_kind(frames: FrameSource) -> None:
+    """Say what the file states, before it is read."""
+    if frames.video.other_streams:
+        others = ", ".join(map(str, frames.video.other_streams))
+        say(
+            f"{frames.path}: has several streams of pictures; stream {frames.stream} is captured, and --capture.stream "
+            f"chooses another ({others})"
+        )
+    if frames.video.hdr:
+        say(f"{frames.path}: HDR video ({frames.video.hdr}); its pictures are tone-mapped to sRGB")
+    if frames.video.has_field_pictures:
+        say(
+            f"warning: {frames.path}: each picture is a single field of interlaced video, of half the height (HEVC); "
+            "mien does not join them: deinterlace it with a video program and give the result"
+        )
+
+
+def tell_fields(frames: FrameSource, survey: Survey) -> None:
+    """Say how many frames were deinterlaced, and whether the file seems to be marked wrongly."""
+    count, total, has_combs = int(survey.deinterlaced.sum()), len(survey.numbers), _has_combs(survey)
+    if count:
+        told = f"{frames.path}: interlaced; {count} of {total} frames are deinterlaced, each to one picture"
+        if not has_combs and frames.deinterlace == "auto":
+            told += "; they show no combs: if filmed progressively, --capture.deinterlace never keeps more detail"
+        say(told)
+    elif has_combs and frames.deinterlace == "auto":
+        say(
+            f"warning: {frames.path}: its lines alternate between two moments, but it is not marked as interlaced; if "
+            "moving edges look like combs, add --capture.deinterlace always"
+        )
+
+
+def kind_report(frames: FrameSource, survey: Survey) -> dict[str, Any]:
+    """Return the entries for the capture's report."""
+    return {
+        "hdr": frames.video.hdr or None,
+        "frames_deinterlaced": int(survey.deinterlaced.sum()),
+        "combs": _has_combs(survey),
+    }
+
+
+def _has_combs(survey: Survey) -> bool:
+    # A still head has none, so the frames with the most count.
+    measured = survey.combs[np.isfinite(survey.combs)]
+    return bool(len(measured)) and float(np.quantile(measured, 0.9)) > _MIN_COMBS

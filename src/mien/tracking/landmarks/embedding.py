@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
+from mien.capture.person.backend import load_solution, quiet_mediapipe
 from mien.capture.person.faces import LANDMARKS
-from mien.capture.person.quiet_mediapipe import load_solution, quiet_mediapipe
 from mien.errors import UserError
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams

@@ -6,8 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture.cameras.reading_fit import advice_of, is_wrong, rank_readings
-from mien.capture.cameras.readings import readings_of
+from mien.capture.cameras.readings import advice_of, is_wrong, rank_readings, readings_of
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
 from mien.render.mesh import vertex_normals

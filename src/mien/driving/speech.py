@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mien.driving.motion import ARKIT_NAMES, Motion
-from mien.media.sound import RATE, read_sound
+from mien.media.video import RATE, read_sound
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _SPEECH_WINDOW = 0.04
@@ -35,26 +35,13 @@ _SPEECH_SILENCE = -55.0
 """Loudness of silence in dB, where 0 is the loudest possible. Files that are never louder do not move the mouth."""
 _SPEECH_EXPONENT = 2.0  # exponent from the level in dB to opening
 _SPEECH_SPLIT = (700.0, 2500.0)  # frequencies in Hz below which sound is low, and above which it is high
-_SPEECH_JAW = 0.55  # largest coefficient of the open jaw
-_SPEECH_LOWER_LIP = 0.25  # largest coefficient of the lowered lower lip
-_SPEECH_UPPER_LIP = 0.12  # largest coefficient of the raised upper lip
-_SPEECH_FUNNEL = 0.35  # largest coefficient of rounded lips
-_SPEECH_STRETCH = 0.3  # largest coefficient of wide lips
-_SPEECH_LESS_JAW = 0.6  # share of the jaw's opening that high sounds take away
-_SPEECH_PRESS = 0.3  # largest coefficient of pressed lips, at p, b and m
 _SPEECH_SHUT_WITHIN = 0.14  # time within which sound is as loud before and after a drop at which lips shut, in seconds
 _SPEECH_SHUT_DROP = (14.0, 26.0)
 """Drops of the level in dB from which on lips begin to shut, and at which they are shut. No real speech was
 compared."""
 _SPEECH_SHUT_HISS = 6.0  # how much energy at high frequencies keeps lips open, as at s: from its inverse on, they are
 _SPEECH_SHUT_BESIDE = 0.3  # how shut lips are in the picture before and after that in which they are shut
-_SPEECH_SWAY = (0.012, 0.02, 0.008)  # sizes of the head's slow waves about x, y and z, in radians
-_SPEECH_BLINK_EVERY = 3.5  # mean time between blinks, in seconds, as in the exported page
-_SPEECH_BLINK_CLOSING = 0.08  # time in which lids close, in seconds, as in the exported page
-_SPEECH_BLINK_OPENING = 0.17  # time in which they open, in seconds, as in the exported page
-
-FPS = 30.0
-"""Moments a second of the motion."""
+FPS = 30.0  # moments a second of the motion
 
 
 def read_speech(path: Path) -> Motion:
@@ -63,7 +50,7 @@ def read_speech(path: Path) -> Motion:
 
 
 def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
-    """The motion for a sound with one channel and `mien.media.sound.RATE` samples a second, -1..1."""
+    """The motion for a sound with one channel and `mien.media.video.RATE` samples a second, -1..1."""
     count = max(1, math.ceil(len(samples) / RATE * FPS))
     loudness, level, low, high = _measured(samples, count)
     shut = _shut(level, high)
@@ -72,16 +59,16 @@ def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
     seconds = np.arange(count) / FPS
     blink = np.array([blink_at(moment) for moment in seconds])
     given = {
-        "jawOpen": _SPEECH_JAW * opening * (1 - _SPEECH_LESS_JAW * high),
-        "mouthLowerDownLeft": _SPEECH_LOWER_LIP * opening,
-        "mouthLowerDownRight": _SPEECH_LOWER_LIP * opening,
-        "mouthUpperUpLeft": _SPEECH_UPPER_LIP * opening,
-        "mouthUpperUpRight": _SPEECH_UPPER_LIP * opening,
-        "mouthFunnel": _SPEECH_FUNNEL * opening * low,
-        "mouthStretchLeft": _SPEECH_STRETCH * opening * high,
-        "mouthStretchRight": _SPEECH_STRETCH * opening * high,
-        "mouthPressLeft": _SPEECH_PRESS * shut,
-        "mouthPressRight": _SPEECH_PRESS * shut,
+        "jawOpen": 0.55 * opening * (1 - 0.6 * high),
+        "mouthLowerDownLeft": 0.25 * opening,
+        "mouthLowerDownRight": 0.25 * opening,
+        "mouthUpperUpLeft": 0.12 * opening,
+        "mouthUpperUpRight": 0.12 * opening,
+        "mouthFunnel": 0.35 * opening * low,
+        "mouthStretchLeft": 0.3 * opening * high,
+        "mouthStretchRight": 0.3 * opening * high,
+        "mouthPressLeft": 0.3 * shut,
+        "mouthPressRight": 0.3 * shut,
         "eyeBlinkLeft": blink,
         "eyeBlinkRight": blink,
     }
@@ -156,7 +143,7 @@ def _smooth(values: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
 
 def blink_at(seconds: float) -> float:
     """How closed the lids are at a time, 0..1. There is one blink in each stretch of time, as in the exported page."""
-    every, closing, opening = _SPEECH_BLINK_EVERY, _SPEECH_BLINK_CLOSING, _SPEECH_BLINK_OPENING
+    every, closing, opening = 3.5, 0.08, 0.17  # seconds
     stretch = math.floor(seconds / every)
     since = seconds - every * (stretch + 0.7 * _random(stretch))
     if not 0 <= since <= closing + opening:
@@ -172,11 +159,9 @@ def _random(seed: int) -> float:
 
 def sway_at(seconds: Float[np.ndarray, " t"]) -> Float32[np.ndarray, "t 3"]:
     """Turns of a head that is never quite still, as axis-angle vectors in radians: sums of slow waves from 0."""
-    waves = np.stack([size * _wave(seconds, k) for k, size in enumerate(_SPEECH_SWAY)], axis=1)
-    turns = matrix_from_axis_angle(waves)
+    waves = []
+    for k, size in enumerate((0.012, 0.02, 0.008)):  # about x, y and z, in radians
+        slow, fast = 0.61 * (1 + 0.37 * k), 1.13 * (1 + 0.21 * k)
+        waves.append(size * (np.sin(slow * seconds + 2.1 * k) + 0.6 * np.sin(fast * seconds + 4.3 * k)))
+    turns = matrix_from_axis_angle(np.stack(waves, axis=1))
     return axis_angle_from_matrix(turns[0].T @ turns).astype(np.float32)
-
-
-def _wave(seconds: Float[np.ndarray, " t"], k: int) -> Float[np.ndarray, " t"]:
-    slow, fast = 0.61 * (1 + 0.37 * k), 1.13 * (1 + 0.21 * k)
-    return np.sin(slow * seconds + 2.1 * k) + 0.6 * np.sin(fast * seconds + 4.3 * k)

@@ -4,11 +4,19 @@ Live Link Face has the columns Timecode (HH:MM:SS:FF.fraction), BlendshapeCount,
 letter (EyeBlinkLeft), then optionally HeadYaw, HeadPitch, HeadRoll and Yaw, Pitch, Roll of LeftEye and RightEye. Angles
 are in radians, in the order yaw, pitch, roll. Yaw is positive to the subject's right, pitch downwards, roll to the
 subject's left shoulder. These are Unreal's angles of ARKit's transforms. Their signs and order were checked for the
-eyes on real takes, against the eyeLook coefficients; those of the head are assumed to be the same. Jaw and mouth slide
-to the observer's sides (`mien.driving.sources.sides`).
+eyes on real takes, against the eyeLook coefficients; those of the head are assumed to be the same.
 
 Other tables have a column timestamp_ms, time (seconds) or frame instead of the timecode, and any of ARKit's names.
-Their sides are those of the names.
+
+Left and right are the performer's in all recordings, but jaw and mouth of Live Link Face slide to the observer's sides
+(docs/conventions.md has the table):
+
+- In two public takes, MouthLeft - MouthRight goes against MouthUpperUpLeft - MouthUpperUpRight (correlation -0.91 and
+  -0.81). In pictures, a mouth that slides to one side lifts the lip of that side: with MediaPipe, whose MouthLeft moves
+  the lips to the performer's left (+0.92 with their place), the correlation is +0.56.
+- JawLeft - JawRight goes with MouthLeft - MouthRight in the same takes (+0.83 and +0.85), as in pictures (+0.32), so
+  the jaw has the sides of the mouth.
+- An importer for Blender has a switch that exchanges MouthLeft and MouthRight of the app.
 """
 
 import csv
@@ -17,9 +25,10 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from mien.disk.tables import table_rows, with_point
+from mien.driving.blendshape_json import arkit_index
 from mien.driving.motion import (
     ARKIT_NAMES,
     MAX_COEFFICIENT,
@@ -32,8 +41,6 @@ from mien.driving.motion import (
     out_of_range,
     shorten,
 )
-from mien.driving.sources.json_layouts import arkit_index
-from mien.driving.sources.sides import LIVE_LINK_FACE, PLAIN, as_performer
 from mien.errors import UserError
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
@@ -41,22 +48,17 @@ HEAD = ("HeadYaw", "HeadPitch", "HeadRoll")
 EYES = tuple(f"{side}Eye{angle}" for side in ("Left", "Right") for angle in ("Yaw", "Pitch", "Roll"))
 _TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(?:\.([0-9]{1,20}))?")
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
-_USUAL_RATE = 60
-_DAY = 86_400
-"""Seconds of a day. A timecode that goes back by more than half of them has passed midnight."""
-_OPTIONAL = "tongueOut"
-"""The one coefficient that a csv may lack: it came a year after the others."""
+_DAY = 86_400  # seconds. A timecode that goes back by more than half of them has passed midnight
 _TIMECODE_NAME, _FRAME = "timecode", "frame"
 _UNITS = {"timestamp_ms": 1000.0, "timestampms": 1000.0, "time": 1.0}
 """Columns of times in the file's own clock, and their units in a second."""
-_ASSUMED_RATE = 30.0
-"""Rows a second of a table that has only frame numbers."""
-_MAX_TIME = 1e15
+_ASSUMED_RATE = 30.0  # rows a second of a table that has only frame numbers
 _MAX_TURN, _MAX_SPEED = 1.7, 20.0
 """Largest yaw and pitch of a head or an eye that a camera sees, in radians, and largest speed of a head in radians a
 second. A smaller number of degrees is soon beyond them."""
 _DEGREES = "divide degrees by 57.3"
-_SIDES = ("Left", "Right")
+_EXCHANGED = {"jawLeft": "jawRight", "jawRight": "jawLeft", "mouthLeft": "mouthRight", "mouthRight": "mouthLeft"}
+"""Coefficients that have the observer's sides in Live Link Face, with those of the performer's."""
 
 
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
@@ -64,18 +66,18 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
 
     Rows without a face (count 0) repeat the row before.
 
-    Args:
-        path: The csv file.
-        fps: Frames per second of the timecode, or rows a second where its frame field never changes and where there is
-            no timecode. The default is the smallest usual rate above its highest frame number, or 60 for takes of less
-            than a second.
+    `fps` are frames per second of the timecode, or rows a second where its frame field never changes and where there is
+    no timecode. The default is the smallest usual rate above its highest frame number, or 60 for takes of less than a
+    second.
     """
     header, lines = _read_rows(path)
     columns = {_canonical(name): index for index, name in enumerate(header)}
     notes = _check_columns(path, columns)
     names = [name for name in (*ARKIT_NAMES, *HEAD, *EYES) if name in columns]
     indices = [columns[name] for name in names]
-    found = np.array([_has_face(row, columns, len(header)) for _, row in lines])
+    # If the face is lost, the app writes a count of 0, with or without zeros after it.
+    count = slice(columns.get("blendshapecount"), columns.get("blendshapecount", -1) + 1)
+    found = np.array([[cell.strip() for cell in row[count]] != ["0"] or len(row) > len(header) for _, row in lines])
     if not found.any():
         raise UserError(f"{path}: no row has a face; record it again")
     values = np.zeros((len(lines), len(indices)))
@@ -89,10 +91,15 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     rate, values, lost, said = evenly_timed(path, times, seconds, values, found)
     by_name = dict(zip(names, values.T, strict=True))
     zero = np.zeros(len(values))
-    read = np.stack([by_name.get(name, zero) for name in ARKIT_NAMES], axis=1).astype(np.float32)
-    coefficients = as_performer(read, LIVE_LINK_FACE if _TIMECODE_NAME in columns else PLAIN)
-    eyes, head = _turns(by_name, coefficients)
+    exchanged = _EXCHANGED if _TIMECODE_NAME in columns else {}
+    names = (exchanged.get(name, name) for name in ARKIT_NAMES)
+    coefficients = np.stack([by_name.get(name, zero) for name in names], axis=1).astype(np.float32)
     still = np.zeros((len(values), 3), np.float32)
+    head = _turned(*(by_name[name] for name in HEAD)) if all(name in by_name for name in HEAD) else still
+    eyes = gaze_of(coefficients)
+    if not eyes.any() and all(name in by_name for name in EYES):
+        # The angles of eyes count only if all eyeLook coefficients are zero.
+        eyes = np.stack([_turned(*(by_name[name] for name in names)) for names in (EYES[:3], EYES[3:])], axis=1)
     return Motion(rate, coefficients, eyes, head, still, lost, (*notes, *assumed, *said))
 
 
@@ -115,7 +122,7 @@ def _check_columns(path: Path, columns: dict[str, int]) -> tuple[str, ...]:
             f"{path}: lacks ARKit's names, or a column Timecode, timestamp_ms, time or frame; give a csv of Live Link "
             "Face, or one with such columns"
         )
-    tongue = _OPTIONAL[0].upper() + _OPTIONAL[1:]
+    tongue = "TongueOut"  # came a year after the others
     if missing == [tongue]:
         return (f"{path}: has no column {tongue}, so the tongue stays in",)
     needed = [name for name in missing if name != tongue]
@@ -128,19 +135,6 @@ def _check_columns(path: Path, columns: dict[str, int]) -> tuple[str, ...]:
     return (f"{path}: has no columns {shown} ({len(missing)} in all), so they stay 0",) if missing else ()
 
 
-def _turns(
-    values: dict[str, np.ndarray], coefficients: Float32[np.ndarray, "t 52"]
-) -> tuple[Float32[np.ndarray, "t 2 3"], Float32[np.ndarray, "t 3"]]:
-    """Rotations of the eyes and of the head. The angles of eyes count only if all eyeLook coefficients are zero."""
-    zero = np.zeros((len(coefficients), 3), np.float32)
-    head = _turned(*(values[name] for name in HEAD)) if all(name in values for name in HEAD) else zero
-    eyes = gaze_of(coefficients)
-    if not eyes.any() and all(name in values for name in EYES):
-        sides = [_turned(*(values[f"{side}Eye{angle}"] for angle in ("Yaw", "Pitch", "Roll"))) for side in _SIDES]
-        eyes = np.stack(sides, axis=1)
-    return eyes, head
-
-
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """The header, and all further rows that are not empty, with their line numbers."""
     try:
@@ -150,12 +144,6 @@ def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     if len(rows) < 2:
         raise UserError(f"{path}: has no frames; give a csv of Live Link Face with a header and one row for each frame")
     return rows[0][1], rows[1:]
-
-
-def _has_face(row: list[str], columns: dict[str, int], width: int) -> bool:
-    """Whether a row has a face. If the face is lost, the app writes a count of 0, with or without zeros after it."""
-    count = columns.get("blendshapecount")
-    return not (count is not None and count < len(row) and row[count].strip() == "0" and len(row) <= width)
 
 
 def _number(path: Path, line: int, name: str, text: str) -> float:
@@ -209,8 +197,12 @@ def _seconds(
     if key == _TIMECODE_NAME:
         whole, frames = _timecodes(path, cells)
         if fps is None or frames.astype(int).min() < frames.astype(int).max():
-            seconds, frame = _of_timecodes(path, whole, frames, fps)
-            return seconds, Times(**own, slack=frame, remedy="; delete the line, or set --fps", faster=faster), ()
+            if fps is not None and fps <= int(frames.max()):
+                last = int(frames.max())
+                raise UserError(f"{path}: --fps {fps:g}: its frame numbers go up to {last}; give more than that")
+            usual = next((rate for rate in _RATES if rate > frames.max()), 1000) if whole.max() > whole.min() else 60
+            rate, remedy = fps or usual, "; delete the line, or set --fps"
+            return whole + frames / rate, Times(**own, slack=1 / rate, remedy=remedy, faster=faster), ()
     elif key == _FRAME:
         numbers = _clock(path, name, cells)
         line = f"{path}: has frame numbers and no times, so {_ASSUMED_RATE:g} rows a second are assumed; --fps sets it"
@@ -224,7 +216,7 @@ def _clock(path: Path, name: str, cells: list[tuple[int, str]]) -> np.ndarray:
     """The numbers of a column of times."""
     for line, text in cells:
         try:
-            good = abs(float(with_point(text))) < _MAX_TIME
+            good = abs(float(with_point(text))) < 1e15
         except ValueError:
             good = False
         if not good:
@@ -233,7 +225,7 @@ def _clock(path: Path, name: str, cells: list[tuple[int, str]]) -> np.ndarray:
 
 
 def _timecodes(path: Path, cells: list[tuple[int, str]]) -> tuple[np.ndarray, np.ndarray]:
-    """Whole seconds and frame numbers of timecodes."""
+    """Whole seconds of timecodes, which go on after midnight, and frame numbers."""
     parsed = []
     for line, text in cells:
         match = _TIMECODE.fullmatch(with_point(text.strip()))
@@ -245,19 +237,7 @@ def _timecodes(path: Path, cells: list[tuple[int, str]]) -> tuple[np.ndarray, np
         hours, minutes, seconds, frame = (int(part) for part in match.groups()[:4])
         parsed.append((3600 * hours + 60 * minutes + seconds, frame + float(f"0.{match.group(5) or 0}")))
     whole, frames = np.array(parsed).T
-    return whole, frames
-
-
-def _of_timecodes(path: Path, whole: np.ndarray, frames: np.ndarray, fps: float | None) -> tuple[np.ndarray, float]:
-    """Times in seconds, which go on after midnight, and the duration of a frame of the timecode."""
-    midnights = np.diff(whole, prepend=whole[0]) < -_DAY / 2
-    whole = whole + _DAY * np.cumsum(midnights)
-    if fps is None:
-        spans_seconds = whole.max() > whole.min()
-        fps = next((rate for rate in _RATES if rate > frames.max()), 1000) if spans_seconds else _USUAL_RATE
-    elif fps <= int(frames.max()):
-        raise UserError(f"{path}: --fps {fps:g}: its frame numbers go up to {int(frames.max())}; give more than that")
-    return whole + frames / fps, 1 / fps
+    return whole + _DAY * np.cumsum(np.diff(whole, prepend=whole[0]) < -_DAY / 2), frames
 
 
 def _turned(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:

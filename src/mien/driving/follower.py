@@ -1,5 +1,10 @@
-"""From landmarks of a camera's frames to the face of an avatar: calibration, smoothing, limits, and rest."""
+"""From landmarks of a camera's frames to the face of an avatar: calibration, smoothing, limits, and rest.
 
+Values are smoothed by the One Euro filter (Casiez, Roussel and Vogel, CHI 2012): a low pass whose cutoff grows with the
+speed of each value, so that slow values lose their jitter, and fast ones have no lag.
+"""
+
+import math
 import threading
 from collections import deque
 from dataclasses import dataclass, replace
@@ -10,11 +15,9 @@ import torch
 from jaxtyping import Float
 
 from mien.avatar.baking import as_array
-from mien.driving.keeping import keep_to_filmed
-from mien.driving.live.landmark_fit import Fitted, LandmarkFit
-from mien.driving.live.one_euro import OneEuro
+from mien.driving.landmark_fit import Fitted, LandmarkFit
 from mien.driving.rest import REST_HEAD, kept_share, rest_of
-from mien.driving.transfer import drive
+from mien.driving.transfer import drive, keep_to_filmed
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.runtime.baked import Filmed
@@ -34,16 +37,42 @@ _EYE_CUTOFF = (2.5, 4.0)
 """The same of eyes and lids. Measured: without smoothing of eyes and mouth, the mean correlation with the truth is
 0.912 instead of 0.913 (log, 11-23)."""
 _MOUTH_CUTOFF = (2.0, 4.0)  # the same of jaw and mouth
+_SPEED_CUTOFF = 3.0
+"""Cutoff of the low pass of the speeds, in Hz. Chosen for the exported page with the other two numbers of its filter
+(log, "One Euro filter")."""
 _OTHER_CUTOFF = (1.2, 2.0)  # the same of the other coefficients
 
 State = Literal["waiting", "learning", "following", "resting"]
 """waiting: there was no face yet. learning: the face at rest is being learnt. following. resting: the face is away."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, " 3"]
+class OneEuro:
+    """The filter of n values."""
+
+    def __init__(self, cutoff: Float[np.ndarray, " n"], beta: Float[np.ndarray, " n"]) -> None:
+        """Start with a cutoff at rest in Hz, which grows by `beta` Hz for a speed of one unit a second."""
+        self._cutoff, self._beta = cutoff, beta
+        self._value: Float[np.ndarray, " n"] | None = None
+        self._speed = np.zeros(len(cutoff))
+        self._seconds = 0.0
+
+    def __call__(self, value: Float[np.ndarray, " n"], seconds: float) -> Float[np.ndarray, " n"]:
+        """The smoothed value at a time, which increases. The first value stays as it is."""
+        if self._value is None:
+            self._value = value.copy()
+        elif seconds > self._seconds:
+            elapsed = seconds - self._seconds
+            speed = (value - self._value) / elapsed
+            self._speed += _share(np.full(len(value), _SPEED_CUTOFF), elapsed) * (speed - self._speed)
+            cutoff = self._cutoff + self._beta * np.abs(self._speed)
+            self._value = self._value + _share(cutoff, elapsed) * (value - self._value)
+        self._seconds = seconds
+        return self._value.copy()
+
+
+def _share(cutoff: Float[np.ndarray, " n"], elapsed: float) -> Float[np.ndarray, " n"]:
+    """Share of the new value in a low pass."""
+    return 1 / (1 + 1 / (2 * math.pi * cutoff * elapsed))
 
 
 @dataclass(frozen=True)
@@ -67,14 +96,9 @@ class Follower:
         eye: Float[np.ndarray, " 3"],
         options: FollowOptions | None = None,
     ) -> None:
-        """Prepare to follow.
+        """Prepare to follow with the avatar's person at rest (one timestep). `filmed` is None for no limits.
 
-        Args:
-            model: The avatar's face model.
-            person: One timestep of the avatar's person at rest.
-            filmed: What the avatar was filmed with; None for no limits.
-            eye: Position of the camera that sees the avatar, in world space, in metres.
-            options: How it follows.
+        `eye` is the position of the camera that sees the avatar, in world space, in metres.
         """
         self._options = options or FollowOptions()
         self._model, self._person = model, person
@@ -86,7 +110,8 @@ class Follower:
         self._fit = LandmarkFit(model, person)
         self._lock = threading.Lock()
         self._learning: deque[tuple[float, np.ndarray]] = deque(maxlen=120)
-        self._rest: _Pose | None = None
+        self._rest: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None = None
+        """Rotation and translation of the head at rest."""
         self._seen_at: float | None = None
         self._values = np.zeros(6 + len(self._fit.names))
         self._driven_at = 0.0
@@ -96,30 +121,13 @@ class Follower:
         self.error = float("nan")
         """Weighted root mean square distance in pixels between landmarks and their fit in the last frame."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of what is followed, besides the head: expressions, then components of joints."""
-        return self._fit.names
-
-    @property
-    def values(self) -> dict[str, float]:
-        """The smoothed coefficients by name, as differences from the person at rest."""
-        return dict(zip(self._fit.names, self._values[6:].tolist(), strict=True))
-
     def recalibrate(self) -> None:
         """Learn the face at rest anew from the next second, whatever it shows: the person asks for it."""
         with self._lock:
             self._must_learn = True
 
     def __call__(self, landmarks: Float[np.ndarray, "l 2"] | None, width: int, height: int, seconds: float) -> Face:
-        """The avatar's face after the next frame.
-
-        Args:
-            landmarks: MediaPipe's landmarks of the person in pixels, or None if there is no face.
-            width: Width of the frame in pixels.
-            height: Height of the frame in pixels.
-            seconds: Time of the frame. Times increase.
-        """
+        """The avatar's face after the next frame, of that size in pixels and at that time. None if there is no face."""
         with self._lock:
             if self._must_learn:
                 self._must_learn, self._asked, self._rest = False, True, None
@@ -155,17 +163,17 @@ class Follower:
         away = axis_angle_from_matrix(rotation[None])
         share = float(kept_share(torch.tensor(np.linalg.norm(away)), REST_HEAD))
         rotation = rotation if share == 1 or self._asked else matrix_from_axis_angle(share * away)[0]
-        self._rest = _Pose(rotation, np.median([pose.translation for pose in poses], axis=0))
+        self._rest = rotation, np.median([pose.translation for pose in poses], axis=0)
         self._learning.clear()
         self._smoothing = self._new_smoothing()
         self._smoothing(self._values, self._driven_at)
 
     def _follow(self, fitted: Fitted, seconds: float) -> None:
         self.state, self.error = "following", fitted.error
-        rest = self._rest
-        assert rest is not None
-        turn = axis_angle_from_matrix((rest.rotation.T @ fitted.rotation)[None])[0]
-        moved = rest.rotation.T @ (fitted.translation - rest.translation)
+        assert self._rest is not None
+        rotation, translation = self._rest
+        turn = axis_angle_from_matrix((rotation.T @ fitted.rotation)[None])[0]
+        moved = rotation.T @ (fitted.translation - translation)
         self._values = self._smoothing(np.concatenate([turn, moved, fitted.coefficients]), seconds)
 
     def _without_face(self, seconds: float) -> None:
@@ -181,9 +189,7 @@ class Follower:
         self._smoothing(self._values, seconds)
 
     def _face(self) -> Face:
-        still = np.zeros(3)
-        driver = self._fit.face_of(self._values[:3], self._values[3:6], self._values[6:])
-        at_rest = self._fit.face_of(still, still, np.zeros(len(self._fit.names)))
+        driver, at_rest = self._fit.face_of(self._values), self._fit.face_of(np.zeros_like(self._values))
         bounds = self._model.expression_bounds
         face = drive(driver, at_rest, self._at_rest, bounds, self._options.head_pose)
         if self._filmed is not None:
@@ -193,20 +199,12 @@ class Follower:
         )
 
     def _new_smoothing(self) -> OneEuro:
-        kinds = ["head"] * 3 + ["place"] * 3 + [_kind(name) for name in self._fit.names]
-        cutoffs = {
-            "head": _HEAD_CUTOFF,
-            "place": _PLACE_CUTOFF,
-            "eye": _EYE_CUTOFF,
-            "mouth": _MOUTH_CUTOFF,
-            "other": _OTHER_CUTOFF,
-        }
-        cutoff, beta = np.array([cutoffs[kind] for kind in kinds]).T
-        return OneEuro(cutoff, beta)
+        pose = [_HEAD_CUTOFF] * 3 + [_PLACE_CUTOFF] * 3
+        return OneEuro(*np.array([*pose, *map(_cutoff, self._fit.names)]).T)
 
 
-def _kind(name: str) -> str:
+def _cutoff(name: str) -> tuple[float, float]:
     lowered = name.lower()
     if "eye" in lowered:
-        return "eye"
-    return "mouth" if lowered.startswith(("mouth", "jaw", "tongue")) else "other"
+        return _EYE_CUTOFF
+    return _MOUTH_CUTOFF if lowered.startswith(("mouth", "jaw", "tongue")) else _OTHER_CUTOFF

@@ -41,11 +41,9 @@ _LIVE_GAZE_LIMITS = (0.35, 0.5)
 """The same of the angles of eyes, in radians. In clips of seven people, medians are up to 0.24."""
 
 _OPENCV = np.diag([1.0, -1.0, -1.0])
-_DAMPING = 1e-6
 _LIMITED = ("jaw", "brow", "mouthSmile", "mouthPucker", "mouthFunnel")
 """Beginnings of coefficients that count as motion if they are large. All others but gazes are taken as shape."""
-_NEAR, _FAR = 0.1, 10.0
-"""Bounds of the distance of a head, in metres."""
+_NEAR, _FAR = 0.1, 10.0  # bounds of the distance of a head, in metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +64,7 @@ class LandmarkFit:
     """Fits one person's landmarks, frame after frame."""
 
     def __init__(self, model: FaceModel, person: FaceParams) -> None:
-        """Prepare the fit.
-
-        Args:
-            model: The face model of the avatar, with its MediaPipe landmarks.
-            person: One timestep, whose identity stands for that of the driver.
-        """
+        """Prepare the fit. The identity of `person`, one timestep, stands for that of the driver."""
         settings = TrackingSettings()
         layout = layout_of(model)
         reduced = reduce_face_model(model, layout, read_response(model, settings.bias_sigma, choose_detector()))
@@ -106,13 +99,7 @@ class LandmarkFit:
         self._last = None
 
     def __call__(self, landmarks: Float[np.ndarray, "l 2"], width: int, height: int) -> Fitted:
-        """Fit the landmarks of the next frame.
-
-        Args:
-            landmarks: MediaPipe's landmarks in pixels.
-            width: Width of the picture in pixels.
-            height: Height of the picture in pixels.
-        """
+        """Fit MediaPipe's landmarks of the next frame, in pixels of a picture of that size."""
         centered, focal = landmarks - (0.5 * width, 0.5 * height), FOCAL * max(width, height)
         if self._last is None:
             start, outlier = self._facing(centered, focal), FIRST_OUTLIER
@@ -131,14 +118,12 @@ class LandmarkFit:
         self._bias, self._held = np.zeros_like(self._rest), np.zeros_like(self._held)
         if not as_it_is:
             self._held = self._expression_in(seen, width, height)
-        focal, size = FOCAL * max(width, height), np.array((0.5 * width, 0.5 * height))
+        focal = FOCAL * max(width, height)
         self._bias = np.zeros_like(self._rest)
         for _ in range(2):
             offsets = []
             for landmarks in seen:
-                centered = landmarks - size
-                start = replace(self._facing(centered, focal), coefficients=self._held)
-                pose = self._find_pose(start, centered, focal)
+                centered, pose = landmarks - (0.5 * width, 0.5 * height), self.rest_pose(landmarks, width, height)
                 points = self._points(pose)
                 turned = points @ pose.rotation.T + pose.translation
                 depth = -turned[:, 2]
@@ -155,10 +140,8 @@ class LandmarkFit:
             fits.append(self(landmarks, width, height).coefficients)
         middle = torch.from_numpy(np.median(fits, axis=0))
         moved = torch.zeros_like(middle)
-        for limits, starts in (
-            (_LIVE_EXPRESSION_LIMITS, _LIMITED),
-            (_LIVE_GAZE_LIMITS, ("left_eye", "right_eye")),
-        ):
+        eyes = ("left_eye", "right_eye")
+        for limits, starts in ((_LIVE_EXPRESSION_LIMITS, _LIMITED), (_LIVE_GAZE_LIMITS, eyes)):
             ours = torch.tensor([name.startswith(starts) for name in self.names])
             moved = torch.where(ours, middle * (1 - kept_share(middle.abs(), limits)), moved)
         return moved.numpy()
@@ -182,17 +165,13 @@ class LandmarkFit:
         projected = self._project(points @ rotation.T + translation, FOCAL * max(width, height))
         return projected + (0.5 * width, 0.5 * height)
 
-    def face_of(
-        self, rotation: Float[np.ndarray, " 3"], translation: Float[np.ndarray, " 3"], coefficients: np.ndarray
-    ) -> FaceParams:
-        """The face parameters of a head pose and of coefficients, as one timestep in float32, with identity zero."""
-        state = np.concatenate([rotation, translation, coefficients])[None]
-        given = self._layout.face_params(torch.from_numpy(state), torch.zeros(1, dtype=torch.float64))
+    def face_of(self, state: Float[np.ndarray, " s"]) -> FaceParams:
+        """The face parameters of rotation, translation and coefficients, as one timestep, with identity zero."""
+        given = self._layout.face_params(torch.from_numpy(state[None]), torch.zeros(1, dtype=torch.float64))
         return replace(given, **{name: tensor.float() for name, tensor in given.tensors().items()})
 
     def _points(self, fitted: Fitted) -> Float[np.ndarray, "l 3"]:
-        most = LARGEST_TURN
-        turn = axis_angle_from_matrix(fitted.rotation[None])[0][:2].clip(-most, most)
+        turn = axis_angle_from_matrix(fitted.rotation[None])[0][:2].clip(-LARGEST_TURN, LARGEST_TURN)
         shape = self._rest + self._bias + np.tensordot(turn, self._by_turn, 1)
         return shape + self._basis @ fitted.coefficients
 
@@ -257,7 +236,7 @@ class LandmarkFit:
                 )
             free = ~held
             normal = hessian[np.ix_(free, free)]
-            normal[np.diag_indices_from(normal)] *= 1 + _DAMPING
+            normal[np.diag_indices_from(normal)] *= 1 + 1e-6
             step = np.zeros(len(hessian))
             step[free] = np.linalg.solve(normal, descent[free])
             rotation = matrix_from_axis_angle(step[None, :3])[0] @ at.rotation

@@ -1,11 +1,14 @@
-"""Layouts of json with blend shapes, by program. Each function turns one layout into `Recorded`.
+"""Blend shapes as json, in the layouts of several programs. Each function turns one layout into `Recorded`.
 
 The plain layout is a list of frames, {"timestamp_ms": 0, "blendshapes": {"jawOpen": 0.3, ...}}. Missing names are 0.
+Times are in milliseconds as "timestamp_ms" (or "timestampMs") and in seconds as "time". A frame without a face repeats
+the frame before it.
 
 MediaPipe's FaceLandmarker gives results, one or a list of them, to which the user adds a time. JavaScript names them
 {"faceBlendshapes": [{"categories": [{"categoryName": .., "score": ..}]}], "facialTransformationMatrixes": [{"data": [16
 numbers, column by column]}]}, and Python {"face_blendshapes": [[{"category_name": .., "score": ..}]],
-"facial_transformation_matrixes": [4 rows of 4 numbers]}. Only the first face counts.
+"facial_transformation_matrixes": [4 rows of 4 numbers]}. Only the first face counts. Matrices are in centimetres, with
+OpenGL axes.
 
 BEAT and LAM write {"names": [..], "frames": [{"weights": [..], "time": seconds}]}.
 
@@ -15,34 +18,44 @@ Azure's speech service sends pieces of a film with 60 frames a second, {"FrameIn
 ..]}: ARKit's 52 with left before right, then the rolls of the head and of both eyes, whose unit is not documented.
 """
 
+import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from mien.driving.motion import ARKIT_NAMES, shorten
-from mien.driving.sources.sides import AUDIO2FACE, AZURE_SPEECH, FACE_LANDMARKER, NAMED_WEIGHTS, PLAIN, Sides
+from mien.disk.limits import has_last_row
+from mien.disk.reading import parse_json
+from mien.disk.tables import text_of
+from mien.driving.motion import (
+    ARKIT_NAMES,
+    MAX_COEFFICIENT,
+    MIN_COEFFICIENT,
+    Motion,
+    Times,
+    evenly_timed,
+    gaze_of,
+    open_recording,
+    out_of_range,
+    shorten,
+)
 from mien.errors import UserError
+from mien.runtime.rotation import axis_angle_from_matrix, rotation_of
 
 Scores = dict[str, Any]
 _MILLISECOND_KEYS, _SECOND_KEYS = ("timestamp_ms", "timestampMs"), ("time",)
 _BLENDSHAPES = ("faceBlendshapes", "face_blendshapes")
 _MATRICES = ("facialTransformationMatrixes", "facial_transformation_matrixes")
-_CATEGORY = ("categoryName", "category_name")
-_MAX_MATRIX_ENTRY = 1e6
-"""Largest number in a transformation matrix (translations are in centimetres)."""
 _MIN_FPS, _MAX_FPS = 1.0, 500.0
 _AZURE_FPS, _AZURE_ROLLS = 60.0, 3
 _AZURE_NAMES = tuple(
     {"jawRight": "jawLeft", "jawLeft": "jawRight", "mouthRight": "mouthLeft", "mouthLeft": "mouthRight"}.get(name, name)
     for name in ARKIT_NAMES
 )
-_MAX_FRAMES = 10 * 60 * 60 * 60
-"""Most frames of Azure's pieces: ten hours."""
-_LEAST_KNOWN = 0.5
-"""Least share of ARKit's names among the names of a file whose other names are left out."""
+_MAX_FRAMES = 10 * 60 * 60 * 60  # of Azure's pieces: ten hours
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +72,13 @@ class Recorded:
     """Name of the times."""
     units: float
     """Units of the times in a second."""
-    fps: float | None
+    fps: float | None = None
     """Frames per second, if the file states them."""
-    sides: Sides
-    """The sides of its names."""
     notes: tuple[str, ...] = ()
     """Lines for the user."""
 
 
-def recorded(content: Any, path: Path) -> Recorded:
+def _recorded(content: Any, path: Path) -> Recorded:
     """The frames of a json file of any layout."""
     if isinstance(content, dict) and "weightMat" in content:
         return _audio2face(content, path)
@@ -80,42 +91,39 @@ def recorded(content: Any, path: Path) -> Recorded:
         )
     if all("BlendShapes" in frame and "FrameIndex" in frame for frame in frames):
         return _azure_speech(frames, path)
-    scores, matrices, landmarker = [], [], False
+    scores, matrices = [], []
     for index, frame in enumerate(frames):
         where = f"{path}, frame {index}"
-        of_landmarker = _of(frame, _BLENDSHAPES) is not None
-        landmarker |= of_landmarker
-        found, matrix = from_face_landmarker(frame, where) if of_landmarker else (_plain(frame, where), None)
+        if _of(frame, _BLENDSHAPES) is not None:
+            found, matrix = _from_face_landmarker(frame, where)
+        else:
+            found, matrix = frame.get("blendshapes"), None
+            if "blendshapes" not in frame or not (found is None or isinstance(found, dict)):
+                raise UserError(f'{where}: has no "blendshapes": {{name: score}} (null if no face was found)')
         scores.append(found)
         matrices.append(matrix)
     key, units, times = _times(frames)
-    return Recorded(scores, matrices, times, key, units, None, FACE_LANDMARKER if landmarker else PLAIN)
+    return Recorded(scores, matrices, times, key, units)
 
 
-def from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[Scores | None, np.ndarray | None]:
-    """Scores by name and T_camera_face [4, 4] (centimetres, OpenGL axes) of the first face in a result.
-
-    Either is None if the result does not have it.
-    """
+def _from_face_landmarker(frame: dict[str, Any], where: str) -> tuple[Scores | None, np.ndarray | None]:
+    """Scores by name and T_camera_face [4, 4] (centimetres, OpenGL axes) of the first face, each if there is one."""
     try:
         faces, poses = _of(frame, _BLENDSHAPES), _of(frame, _MATRICES) or []
         scores, matrix = None, None
         if faces:
             entries = faces[0]["categories"] if isinstance(faces[0], dict) else faces[0]
-            scores = {_category(entry): entry["score"] for entry in entries}
+            key = "category_name" if entries and "category_name" in entries[0] else "categoryName"
+            scores = {entry[key]: entry["score"] for entry in entries}
         if poses and isinstance(poses[0], dict):
             matrix = np.array(poses[0]["data"], dtype=np.float64).reshape(4, 4).T
         elif poses:
             matrix = np.array(poses[0], dtype=np.float64).reshape(4, 4)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(f"{where}: does not have the layout of a FaceLandmarker result ({short(error)})") from None
-    if matrix is not None and not (np.abs(matrix) < _MAX_MATRIX_ENTRY).all():
+    if matrix is not None and not (np.abs(matrix) < 1e6).all():
         raise UserError(f"{where}: its facial transformation matrix contains NaN or huge numbers; correct or delete it")
     return scores, matrix
-
-
-def _category(entry: dict[str, Any]) -> str:
-    return entry[next((key for key in _CATEGORY if key in entry), _CATEGORY[0])]
 
 
 def _of(frame: dict[str, Any], keys: Iterable[str]) -> Any:
@@ -130,13 +138,6 @@ def _times(frames: list[Any]) -> tuple[str, float, list[Any]]:
     return keys[0], units, [_of(frame, keys) for frame in frames]
 
 
-def _plain(frame: dict[str, Any], where: str) -> Scores | None:
-    scores = frame.get("blendshapes")
-    if "blendshapes" not in frame or not (scores is None or isinstance(scores, dict)):
-        raise UserError(f'{where}: has no "blendshapes": {{name: score}} (null if no face was found)')
-    return scores
-
-
 def _named_weights(content: dict[str, Any], path: Path) -> Recorded:
     """A file of BEAT or LAM."""
     frames, about = content["frames"], content.get("metadata")
@@ -148,7 +149,7 @@ def _named_weights(content: dict[str, Any], path: Path) -> Recorded:
         notes = (*notes, f'{path}: "rotation" is not read, so the head keeps still')
     key, units, times = _times(frames)
     fps = _rate(about.get("fps") if isinstance(about, dict) else None, "fps", path)
-    return Recorded(scores, [None] * len(frames), times, key, units, fps, NAMED_WEIGHTS, notes)
+    return Recorded(scores, [None] * len(frames), times, key, units, fps, notes)
 
 
 def _audio2face(content: dict[str, Any], path: Path) -> Recorded:
@@ -158,7 +159,7 @@ def _audio2face(content: dict[str, Any], path: Path) -> Recorded:
     names, notes = _known_names(_of(content, ("facsNames", "faceNames")), path)
     scores = [_by_name(names, row, f"{path}, frame {index}") for index, row in enumerate(rows)]
     fps, nothing = _rate(content.get("exportFps"), "exportFps", path), [None] * len(rows)
-    return Recorded(scores, list(nothing), nothing, _SECOND_KEYS[0], 1.0, fps, AUDIO2FACE, notes)
+    return Recorded(scores, list(nothing), nothing, _SECOND_KEYS[0], 1.0, fps, notes)
 
 
 def _azure_speech(pieces: list[dict[str, Any]], path: Path) -> Recorded:
@@ -180,7 +181,7 @@ def _azure_speech(pieces: list[dict[str, Any]], path: Path) -> Recorded:
     if not scores:
         raise UserError(f'{path}: its "BlendShapes" have no frames; save the events of blend shapes')
     notes = (f"{path}: the rolls of head and eyes are not read, so the head keeps still",) if rolls else ()
-    return Recorded(scores, [None] * len(scores), times, "FrameIndex", 1.0, None, AZURE_SPEECH, notes)
+    return Recorded(scores, [None] * len(scores), times, "FrameIndex", 1.0, None, notes)
 
 
 def _rate(value: Any, key: str, path: Path) -> float | None:
@@ -197,7 +198,7 @@ def _known_names(names: Any, path: Path) -> tuple[list[str | None], tuple[str, .
         raise UserError(f"{path}: has no list of names for its weights; export it again")
     known = [name if arkit_index(name) is not None else None for name in names]
     others = [name for name, kept in zip(names, known, strict=True) if kept is None]
-    if len(others) > (1 - _LEAST_KNOWN) * len(names) or not names:
+    if len(others) > 0.5 * len(names) or not names:
         told = f", such as {short(others[0])}" if others else ""
         raise UserError(f"{path}: most of its names are not ARKit's{told}; export it with ARKit's 52 blend shapes")
     if not others:
@@ -223,16 +224,14 @@ def arkit_index(name: Any) -> int | None:
 def _spellings() -> dict[str, int]:
     places = {}
     for index, name in enumerate(ARKIT_NAMES):
-        own = name.replace("Left", "_L").replace("Right", "_R") if name.startswith(_HALVES) else name
+        # Slides have no halves of the face, so Apple does not shorten their sides.
+        is_half = name.endswith(("Left", "Right")) and name not in ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
+        own = name.replace("Left", "_L").replace("Right", "_R") if is_half else name
         for spelling in (name, own):
             places |= {spelling: index, spelling[0].upper() + spelling[1:]: index}
     return places
 
 
-_HALVES = tuple(
-    name.removesuffix("Left") for name in ARKIT_NAMES if name.endswith("Left") and name not in ("jawLeft", "mouthLeft")
-)
-"""Starts of the names that exist once for each half of the face."""
 _INDEX = _spellings()
 
 
@@ -242,3 +241,86 @@ def short(value: object) -> str:
         return shorten(repr(value))
     except ValueError:  # Python refuses to print integers with thousands of digits.
         return f"a number of type {type(value).__name__} with thousands of digits"
+
+
+_DEFAULT_FPS = 30.0
+
+
+def read_blendshape_json(path: Path) -> Motion:
+    """Read motion from blend shapes as json."""
+    try:
+        with open_recording(path) as file:
+            content = parse_json(text_of(file.read()), any_size=True, constants=True)
+    except (OSError, ValueError, MemoryError) as error:
+        raise UserError(f"{path}: cannot be read as json ({error}); give frames of blend shapes") from None
+    read = _recorded(content, path)
+    found = np.array([scores is not None for scores in read.scores])
+    rows = np.zeros((len(found), 52 + 6))
+    for index, scores in enumerate(read.scores):
+        if scores is not None:
+            rows[index, :52] = _row(scores, f"{path}, frame {index}")
+    turned = _place_heads(rows, read.matrices, path)
+    if not found.any():
+        raise UserError(f"{path}: no frame has a face; record it again")
+    seconds, assumed = _seconds(read, path)
+    times = Times(read.time_key, lambda index: f"{path}, frame {index}", read.units)
+    fps, rows, lost, said = evenly_timed(path, times, seconds, rows, found)
+    coefficients = rows[:, :52].astype(np.float32)
+    head = rows[:, 52:].astype(np.float32)
+    notes = (*read.notes, *turned, *assumed, *said)
+    return Motion(fps, coefficients, gaze_of(coefficients), head[:, :3], head[:, 3:], lost, notes)
+
+
+def _row(scores: Scores, where: str) -> Float[np.ndarray, " 52"]:
+    row = np.zeros(52)
+    for name, score in scores.items():
+        if name == "_neutral":
+            continue
+        place = arkit_index(name)
+        if place is None:
+            near = difflib.get_close_matches(str(name), ARKIT_NAMES, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise UserError(f"{where}: there is no blend shape {short(name)}{hint}")
+        is_number = isinstance(score, (int, float)) and not isinstance(score, bool)
+        if not is_number or not MIN_COEFFICIENT <= score <= MAX_COEFFICIENT:
+            remedy = out_of_range(score) if is_number else "give a number from 0 to 1"
+            raise UserError(f"{where}: {name} is {short(score)}; {remedy}")
+        row[place] = score
+    return row
+
+
+def _place_heads(rows: Float[np.ndarray, "t 58"], matrices: list[np.ndarray | None], path: Path) -> tuple[str, ...]:
+    """Fill in rotations and translations of heads. Returns a line for the user if the matrices are transposed.
+
+    A matrix without translation says nothing about its form, so all matrices of the file decide together.
+    """
+    given = [(index, matrix) for index, matrix in enumerate(matrices) if matrix is not None]
+    transposed = not all(has_last_row(matrix) for _, matrix in given) and all(has_last_row(m.T) for _, m in given)
+    for index, matrix in given:
+        upright = matrix.T if transposed else matrix
+        rotation = rotation_of(upright[:3, :3])
+        if rotation is None:
+            raise UserError(
+                f"{path}, frame {index}: its facial transformation matrix is not a rotation; correct or delete it"
+            )
+        if not has_last_row(upright):
+            shown = " ".join(f"{value:g}" for value in upright[3])
+            raise UserError(
+                f"{path}, frame {index}: the last row of its facial transformation matrix is {shown}, not 0 0 0 1; "
+                "correct or delete it"
+            )
+        rows[index, 52:55] = axis_angle_from_matrix(rotation)
+        rows[index, 55:] = 0.01 * upright[:3, 3]
+    return (f"{path}: its facial transformation matrices are transposed, and are read so",) if transposed else ()
+
+
+def _seconds(read: Recorded, path: Path) -> tuple[Float[np.ndarray, " t"], tuple[str, ...]]:
+    """Times of the frames in seconds, and a line for the user if the file has none."""
+    if all(time is None for time in read.times):
+        known = read.fps is not None or len(read.times) < 2
+        line = f'{path}: has no times ("timestamp_ms", or "time" in seconds), so 30 frames a second are assumed'
+        return np.arange(len(read.times)) / (read.fps or _DEFAULT_FPS), () if known else (line,)
+    for index, time in enumerate(read.times):
+        if isinstance(time, bool) or not isinstance(time, (int, float)) or not abs(time) < 1e15:
+            raise UserError(f"{path}, frame {index}: {read.time_key} is {short(time)}; give every frame a number")
+    return np.array(read.times, dtype=np.float64) / read.units, ()
