@@ -352,12 +352,7 @@ def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
     """A drawing that takes a second is not repeated within ten; the newest fit is shown then, and the end always."""
     now, drawn, written = [0.0], [], []
     monkeypatch.setattr(preview.time, "monotonic", lambda: now[0])
-
-    def draw(self: Preview, fit: object) -> None:
-        now[0] += 1.0
-        drawn.append(fit)
-
-    monkeypatch.setattr(Preview, "draw", draw)
+    monkeypatch.setattr(Preview, "draw", lambda self, fit: (drawn.append(fit), now.append(now.pop() + 1)))
     monkeypatch.setattr(Preview, "write", lambda self, stage, progress: written.append(stage == "done"))
     watch = watch_of(tmp_path)
     for second in range(40):

@@ -29,7 +29,7 @@ from mien.tracking.report.overlay import HOTTEST, OverlayPainter, overlay_stride
 from mien.tracking.report.page import findings, name_runs, write_residual_report
 from mien.tracking.report.residuals import residual_report
 from mien.tracking.report.rig import seen_from_front, visible_landmarks
-from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
+from mien.tracking.settings import PhotometricSettings, TrackingSettings
 from mien.tracking.tracking import Appearance, Tracking
 from photometric_case import FOCAL, SIZE, PhotometricCase, make_photometric_case, smooth_noise
 from small_face_model import make_small_face_model
@@ -157,16 +157,6 @@ def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, appea
     found = findings(shown, residual_report(case.capture, shown, case.model))
     odd = " ".join(text for kind, text in found if kind == "odd")
     assert said.split(" so ")[0] in odd or schedule == "landmarks" or alone == 0
-
-
-@pytest.mark.parametrize("schedule", ["fast", "paper"])
-def test_tracked_faces_have_looks(case, schedule):
-    short = PaperSettings(first_steps=60, steps=5, epochs=1, texture_size=128)
-    tracking: Any = track(case.capture, case.model, replace(FAST, schedule=schedule, paper=short))
-    pictures: Any = model_pictures(case.capture, tracking, case.model)
-    assert pictures.compare(3, 0, case.model(tracking.face[3])[0]).rms < 0.08
-    assert tracking.pixel_residuals.median() < 0.08
-    assert residual_report(case.capture, tracking, case.model)["landmarks_only_frames"] == []
 
 
 @pytest.mark.unchecked

@@ -37,12 +37,12 @@ class PhotometricSettings:
     """The fit of faces to pixels, after the fit to landmarks."""
 
     sizes: Annotated[tuple[int, ...], Range(16, 8192, filled=True)] = (256, 256)
-    """Size of the pictures in each round, in pixels. They are scaled down by the whole number that brings their shorter
-    side nearest to it. The texture is estimated again before each round."""
+    """Size of the pictures in each iteration, in pixels. They are scaled down by the whole number that brings their
+    shorter side nearest to it. The texture is estimated again before each iteration."""
     texture_size: Annotated[int, _TEXELS] = 512
     """Texels along each side of the texture."""
     shared_steps: Annotated[int, COUNT_OR_NONE] = 3
-    """Gauss-Newton steps of identity and focal length before each round but the first."""
+    """Gauss-Newton steps of identity and focal length before each iteration but the first."""
     keyframes: Annotated[int, COUNT] = 24
     """Timesteps of each sequence for these steps; fewer with several cameras, for at most twice this many pictures."""
     focal_sigma: Annotated[float, POSITIVE] = 0.04
