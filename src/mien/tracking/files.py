@@ -93,7 +93,8 @@ def _read_tracking(path: Path) -> Tracking:
             sigma, extent = (float(content["looks"][name]) for name in ("sigma", "light_extent"))
             if not (0 <= sigma <= MAX_NUMBER and 0 <= extent <= MAX_NUMBER):
                 raise ValueError(f"sigma {sigma:g} and light_extent {extent:g} are out of range")
-            appearance = Appearance(*(tensors[name] for name in _APPEARANCE), sigma, extent)
+            named = {name: tensors[name] for name in _APPEARANCE}
+            appearance = Appearance(**named, sigma=sigma, light_extent=extent)
         together = content["settings"].get("tracked_together", [])  # read before a capture is tracked again
         names = [content["face_model"], content["face_model_hash"], *together]
         if not isinstance(together, list) or not all(isinstance(name, str) and is_one_line(name) for name in names):

@@ -114,8 +114,8 @@ def estimate_appearance(
             # The median colour in all known texels: at the start, all variation counts as light.
             median, seen = texture.albedo[texture.trust > 0].median(0).values, texture.trust > 0
             texture = replace(texture, albedo=seen[..., None] * median, sigma=_FIRST_SIGMA)
-        surface = space.native(texture, outlier)
-        views = [_relit(surface, own) for own in views]
+        views = [_relit(space.native(texture, outlier), own) for own in views]
+    surface = space.native(texture, outlier)
     even = [[_without_smooth_residual(surface, view, light_radius) for view in own] for own in views]
     return _bake(space, even, texture, outlier), [own[0].light for own in views]
 
