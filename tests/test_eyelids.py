@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -99,8 +98,6 @@ def _camera(size: int) -> Camera:
 
 
 _MOUTH, _EYES, _FOREHEAD = (61, 291, 0, 17), (33, 263), 151
-_FINGERS = (-0.42, -0.14, 0.14, 0.40)
-"""Places of the fingers beside each other, in distances of the outer corners of the eyes."""
 
 
 def with_hand(capture: Capture, frames: list[int]) -> Capture:
@@ -134,31 +131,15 @@ def with_slab(capture: Capture, frames: list[int], group: tuple[int, ...]) -> Ca
 
 
 def _hand(marks: np.ndarray, timestep: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """The opacity of a hand with four fingers that point upwards, and its brightness relative to the skin."""
+    """The opacity of a hand that moves, and its brightness relative to the skin: fingers with dark rims."""
     unit = float(np.linalg.norm(marks[_EYES[0]] - marks[_EYES[1]]))
-    sway = np.array([0.10 * np.sin(0.31 * timestep), 0.06 * np.sin(0.23 * timestep + 1)])
-    middle = marks[list(_MOUTH)].mean(0) + unit * sway
-    angle = 0.25 * np.sin(0.17 * timestep)
-    down, across = np.array([np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
-    # Drawn at four times the size, then averaged: soft edges.
-    large = tuple(4 * side for side in size)
-    hand, shade = np.zeros(large, np.float32), np.ones(large, np.float32)
-
-    def capsule(start: np.ndarray, end: np.ndarray, radius: float, light: float) -> None:
-        first, last = ((4 * point).round().astype(int).tolist() for point in (start, end))
-        for step in range(6):  # brighter in the middle of a finger, with a dark rim
-            width = max(round(4 * 2 * radius * (1 - step / 8)), 1)
-            cv2.line(shade, first, last, light * (0.82 + 0.18 * (1 - (1 - step / 5) ** 2)), width)
-        cv2.line(hand, first, last, 1.0, round(8 * radius))
-
-    knuckles = middle + 0.35 * unit * down
-    capsule(knuckles + 0.25 * unit * down, knuckles + 1.2 * unit * down, 0.48 * unit, 0.95)
-    for number, place in enumerate(_FINGERS):
-        base = knuckles + unit * place * across
-        reach = (0.62, 0.74, 0.72, 0.60)[number] + 0.05 * np.sin(0.4 * timestep + number)
-        capsule(base + 0.3 * unit * down, base - unit * reach * down, 0.135 * unit, 1.0 - 0.03 * number)
-    hand, shade = (cv2.resize(drawn, size[::-1], interpolation=cv2.INTER_AREA) for drawn in (hand, shade))
-    return hand, shade
+    sway, angle = np.sin([0.31 * timestep, 0.23 * timestep + 1]) * (0.10, 0.06), 0.25 * np.sin(0.17 * timestep)
+    x, y = marks[list(_MOUTH)].mean(0) + unit * sway
+    rows, columns = np.mgrid[: size[0], : size[1]].astype(np.float32)
+    across = ((columns - x) * np.cos(angle) - (rows - y) * np.sin(angle)) / unit
+    down = ((columns - x) * np.sin(angle) + (rows - y) * np.cos(angle)) / unit - 0.4
+    hand = np.clip(20 * (1 - np.hypot(across / 0.6, down)), 0, 1)
+    return hand, 0.9 + 0.1 * np.cos(2 * np.pi * across / 0.28) - 0.1 * down
 
 
 TIMESTEPS = 24

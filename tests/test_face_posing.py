@@ -199,9 +199,9 @@ def few():
     model, place = load_face_model("anny"), embedding.best_point
     shipped = model.landmarks["mediapipe"]
 
-    def place_some(views: DetectedViews, faces: Tensor, allowed: Tensor, landmark: int, clamp: float) -> tuple:
+    def place_some(views: DetectedViews, faces: Tensor, allowed: Tensor, landmark: int) -> tuple:
         if landmark in PLACED:
-            return place(views, faces, allowed, landmark, clamp)
+            return place(views, faces, allowed, landmark)
         return shipped.faces[landmark], shipped.barycentric[landmark], torch.tensor(0.0)
 
     with pytest.MonkeyPatch.context() as patched:

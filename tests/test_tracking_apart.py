@@ -144,23 +144,34 @@ def test_focal_length_and_light_of_what_is_held_out_are_those_of_the_others(case
     assert torch.equal(mean_light(shot, others, lights), lights[2]), "other kinds of sequences do not count"
 
 
-@pytest.mark.unchecked
-def test_an_interrupted_tracking_goes_on(case, shaping, apart, tracked, tmp_path, monkeypatch, capsys):
-    """Another held-out sequence, which `tracked` has beside it, changes nothing."""
-    keep, write, names = tmp_path / "kept", StageCache.write, []
+def stops_after(piece: str, written: list[str], stop: Callable[[], object], folder: str | None = None):
+    """Return a `StageCache.write` that collects the names of pieces, and stops the program after one of them."""
+    write = StageCache.write
 
     def write_then_stop(self: StageCache, name: str, tensors: dict) -> None:
         write(self, name, tensors)
-        names.extend([name] if known(self.folder).name == "held_out" and "equations" not in name else [])
-        if names[-1:] in (["sequence-1"], ["lids"]):
-            raise KeyboardInterrupt
+        if folder in (None, known(self.folder).name):
+            written.append(name)
+            if name == piece:
+                stop()
 
-    with monkeypatch.context() as patched:
-        patched.setattr(StageCache, "write", write_then_stop)
-        for last in ("sequence-1", "lids"):
-            names.clear()
+    return write_then_stop
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.unchecked
+def test_an_interrupted_tracking_goes_on(case, shaping, apart, tracked, tmp_path, monkeypatch, capsys):
+    """Another held-out sequence, which `tracked` has beside it, changes nothing."""
+    keep, names = tmp_path / "kept", []
+    for last in ("sequence-1", "lids"):
+        names.clear()
+        with monkeypatch.context() as patched:
+            patched.setattr(StageCache, "write", stops_after(last, names, interrupt, folder="held_out"))
             pytest.raises(KeyboardInterrupt, track_subject, [shaping], case.model, FAST, keep, held_out=[apart.capture])
-            assert names[-1] == last
+        assert names[-1] == last
     assert "sequence-1" not in names, "what was finished is done again"
     found = track_subject([shaping], case.model, FAST, keep, held_out=[apart.capture])
     assert capsys.readouterr().err.count("continues where it was interrupted") == 2
@@ -216,45 +227,24 @@ def test_wrong_names_are_refused(workspace, tmp_path, capsys):
     assert not list(workspace.glob("sequences/*/tracking"))
 
 
-UNKNOWN_FOCAL = TrackingSettings(photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))
-"""Settings with an unknown focal length, so that it has to be stored as well."""
-
-
-def stops_after(piece: str, written: list[str], stop: Callable[[], object]):
-    """Return a `StageCache.write` that collects the names of pieces, and stops the program after one of them."""
-    write = StageCache.write
-
-    def write_then_stop(self: StageCache, name: str, tensors: dict) -> None:
-        write(self, name, tensors)
-        written.append(name)
-        if name == piece:
-            stop()
-
-    return write_then_stop
-
-
-def interrupt() -> None:
-    raise KeyboardInterrupt
-
-
 @pytest.mark.unchecked
 def test_goes_on_from_every_piece(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stages, "FRAMES_AT_ONCE", 5)
     monkeypatch.setattr(refine, "FRAMES_AT_ONCE", 3)
     case, keep = make_photometric_case(timesteps=8), tmp_path / "kept"
-    expected = track_subject([case.capture], case.model, UNKNOWN_FOCAL)[0]
+    expected = track_subject([case.capture], case.model, FAST)[0]
     for piece in ("identity", "frames-0-0", "sequence-0", "step-0-0-equations-1", "iteration-1-shared-0", "lids"):
         before, written = {path.stem for path in keep.glob("*")}, []
         with monkeypatch.context() as patched:
             patched.setattr(StageCache, "write", stops_after(piece, written, interrupt))
-            pytest.raises(KeyboardInterrupt, track_subject, [case.capture], case.model, UNKNOWN_FOCAL, keep)
+            pytest.raises(KeyboardInterrupt, track_subject, [case.capture], case.model, FAST, keep)
         assert written[-1] == piece
         assert not before & set(written), "what was finished is done again"
         assert ("continues where it was interrupted" in capsys.readouterr().err) == bool(before)
     for name in ("sequence-1", "iteration-0"):
         whole = (keep / f"{name}.safetensors").read_bytes()
         (keep / f"{name}.safetensors").write_bytes(whole[: len(whole) // 2])
-    assert_alike(expected, track_subject([case.capture], case.model, UNKNOWN_FOCAL, keep)[0])
+    assert_alike(expected, track_subject([case.capture], case.model, FAST, keep)[0])
     assert "iteration-0.safetensors: is damaged, so this part" in capsys.readouterr().err
     assert not keep.exists()
 
@@ -303,7 +293,7 @@ def test_pieces_are_the_same_made_or_read(tmp_path):
     assert not (tmp_path / "kept").exists()
 
 
-SHOWN = TrackingSettings(focal=FOCAL, photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1))
+SHOWN = replace(FAST, focal=FOCAL)
 
 
 @pytest.fixture
@@ -362,12 +352,7 @@ def test_looking_takes_a_small_part_of_the_time(tmp_path, monkeypatch):
     """A drawing that takes a second is not repeated within ten; the newest fit is shown then, and the end always."""
     now, drawn, written = [0.0], [], []
     monkeypatch.setattr(preview.time, "monotonic", lambda: now[0])
-
-    def draw(self: Preview, fit: object) -> None:
-        now[0] += 1.0
-        drawn.append(fit)
-
-    monkeypatch.setattr(Preview, "draw", draw)
+    monkeypatch.setattr(Preview, "draw", lambda self, fit: (drawn.append(fit), now.append(now.pop() + 1)))
     monkeypatch.setattr(Preview, "write", lambda self, stage, progress: written.append(stage == "done"))
     watch = watch_of(tmp_path)
     for second in range(40):

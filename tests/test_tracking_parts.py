@@ -52,8 +52,9 @@ def test_derivatives_match_finite_differences(which):
     torch.testing.assert_close(project(), camera.project(marks)[0][row], atol=1e-4, rtol=0)
     cameras = batch_of((camera,) * 4)
     linear = reduced.linearize(state, at["identity"], at["bias"], cameras, row, with_identity=True)
-    analytic = {"state": linear.by_frame, "identity": linear.by_identity, "bias": linear.by_bias,
-                "focal": linear.by_log_focal[..., None]}[which]  # fmt: skip
+    assert linear.by_shared is not None
+    analytic = {"state": linear.by_frame, "identity": linear.by_shared[..., :-1], "bias": linear.by_bias,
+                "focal": linear.by_shared[..., -1:]}[which]  # fmt: skip
     step = 1e-6
     shifts = step * torch.eye(at[which].shape[-1], dtype=torch.float64)
     numeric = [(project(**{which: at[which] + s}) - project(**{which: at[which] - s})) / (2 * step) for s in shifts]

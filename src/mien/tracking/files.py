@@ -1,7 +1,6 @@
 """A tracking on disk: tracking.json with its description and tracking.safetensors with its numbers."""
 
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -84,12 +83,18 @@ def _read_tracking(path: Path) -> Tracking:
     if fault:
         raise UserError(f"{path / _TENSORS}: {fault}; {_REMEDY}")
     with expect_whole(path / _JSON, _REMEDY):
-        appearance = None
+        cameras, appearance = [], None
+        for entry, K, viewmat in zip(content["cameras"], tensors["camera_K"], tensors["camera_viewmats"], strict=True):
+            fault = camera_fault(K.numpy(), viewmat.numpy(), entry["width"], entry["height"])
+            if fault is not None:
+                raise ValueError(f"a camera is not valid: {fault}")
+            cameras.append(Camera(K, viewmat, entry["width"], entry["height"]))
         if content.get("looks") is not None:
             sigma, extent = (float(content["looks"][name]) for name in ("sigma", "light_extent"))
             if not (0 <= sigma <= MAX_NUMBER and 0 <= extent <= MAX_NUMBER):
                 raise ValueError(f"sigma {sigma:g} and light_extent {extent:g} are out of range")
-            appearance = Appearance(*(tensors[name] for name in _APPEARANCE), sigma, extent)
+            named = {name: tensors[name] for name in _APPEARANCE}
+            appearance = Appearance(**named, sigma=sigma, light_extent=extent)
         together = content["settings"].get("tracked_together", [])  # read before a capture is tracked again
         names = [content["face_model"], content["face_model_hash"], *together]
         if not isinstance(together, list) or not all(isinstance(name, str) and is_one_line(name) for name in names):
@@ -99,7 +104,7 @@ def _read_tracking(path: Path) -> Tracking:
             face_model_hash=content["face_model_hash"],
             face=FaceParams(**{name: tensors[name] for name in _FACE if name in tensors}),
             valid=tensors["valid"].bool(),
-            cameras=_cameras(content["cameras"], tensors["camera_K"], tensors["camera_viewmats"]),
+            cameras=tuple(cameras),
             neck_lines=tensors["neck_lines"],
             residuals=tensors["residuals"],
             pixel_residuals=tensors.get("pixel_residuals"),
@@ -115,16 +120,6 @@ def check_tracking_of(capture: Capture, tracking: Tracking, where: Path) -> None
     found = (len(tracking.face), len(tracking.cameras), sizes)
     if found != (capture.timesteps, len(capture.camera_ids), {(capture.width, capture.height)}):
         raise UserError(f"{where}: belongs to other pictures than the capture beside it; {_REMEDY}")
-
-
-def _cameras(entries: Any, Ks: Tensor, viewmats: Tensor) -> tuple[Camera, ...]:
-    cameras = []
-    for entry, K, viewmat in zip(entries, Ks, viewmats, strict=True):
-        fault = camera_fault(K.numpy(), viewmat.numpy(), entry["width"], entry["height"])
-        if fault is not None:
-            raise ValueError(f"a camera is not valid: {fault}")
-        cameras.append(Camera(K, viewmat, entry["width"], entry["height"]))
-    return tuple(cameras)
 
 
 def _fault_of(tensors: dict[str, Tensor]) -> str:

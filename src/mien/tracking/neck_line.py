@@ -46,10 +46,7 @@ def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
 
 
 def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[Tensor, "t c 3"]:
-    """Fit a line to the projected bottom vertices of every timestep in every camera (`Tracking.neck_lines`).
-
-    This is the neck line of GaussianAvatars (arXiv:2312.02069), supplement A.
-    """
+    """Fit `Tracking.neck_lines` to the projected bottom vertices: GaussianAvatars (arXiv:2312.02069), supplement A."""
     bottom = bottom_vertices(face_model)
     up = torch.tensor([0.0, 0.1, 0.0]).to(face.head_translation)
     lines = []

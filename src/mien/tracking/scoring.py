@@ -69,10 +69,7 @@ def make_scoring(
 
 
 def cut_at_line(matte: UInt8[np.ndarray, "h w"], line: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "h w"]:
-    """The matte above a neck line (a, b, d) of `Tracking.neck_lines`, with a soft border one pixel wide.
-
-    This is the mask of GaussianAvatars (arXiv:2312.02069), supplement B.
-    """
+    """The matte above a neck line, with a soft border: GaussianAvatars (arXiv:2312.02069), supplement B."""
     height, width = matte.shape
     x, y = np.arange(width)[None] + 0.5, np.arange(height)[:, None] + 0.5
     keep = np.clip(line[0] * x + line[1] * y + line[2] + 0.5, 0, 1)
@@ -97,10 +94,7 @@ def head_mask(
     head_faces: Int[Tensor, "f 3"],
     cut: NeckCut,
 ) -> UInt8[np.ndarray, "h w"]:
-    """The mask of the head in a camera's matte (255 is person), from the posed mesh of the same timestep.
-
-    `head_faces` are its triangles without those of the neck.
-    """
+    """The mask of the head in a matte (255 is person), from the posed mesh and its triangles without the neck's."""
     head = rasterize_mesh(vertices, head_faces, camera).face_index.numpy() >= 0
     return cut_matte(matte, head, above_neck_cut(cut, camera))
 
@@ -108,14 +102,12 @@ def head_mask(
 def cut_matte(
     matte: UInt8[np.ndarray, "h w"], head: Bool[np.ndarray, "h w"], keep: Float[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """The matte times `keep` (0..1), but whole inside the head. Parts that do not touch the head are removed.
-
-    The head is the projected one without its neck.
-    """
+    """The matte times `keep` (0..1), but whole inside the head, and without parts that do not touch the head."""
     columns = np.flatnonzero(head.any(0))
     margin = round(_SILHOUETTE_MARGIN * (columns[-1] - columns[0] + 1)) if len(columns) else 0
     if margin:
-        head = cv2.dilate(head.astype(np.uint8), _disc(margin)).astype(bool)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+        head = cv2.dilate(head.astype(np.uint8), disc).astype(bool)
     mask = np.round(matte * np.where(head, np.float32(1), keep)).astype(np.uint8)
     _, labels = cv2.connectedComponents((mask >= _FAINT).astype(np.uint8))
     ours = np.unique(labels[head & (labels > 0)])
@@ -129,7 +121,3 @@ def head_crop(mask: UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, " 4"]:
     if len(rows) == 0:
         return np.array([0, 0, mask.shape[1], mask.shape[0]])
     return np.array([columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1])
-
-
-def _disc(radius: int) -> UInt8[np.ndarray, "k k"]:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)).astype(np.uint8)

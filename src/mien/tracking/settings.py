@@ -24,8 +24,7 @@ class SmoothnessSettings:
     translation: Annotated[float, _DEVIATION] = 0.1
     """Acceleration of the head across the line of sight, in metres per second squared."""
     depth: Annotated[float, _DEVIATION] = 0.2
-    """Acceleration of the head along the line of sight, which a single camera sees least well, in metres per second
-    squared."""
+    """The same along the line of sight, which a single camera sees least well."""
     rotation: Annotated[float, _DEVIATION] = 2.0
     """Angular acceleration of the head, in radians per second squared."""
     expression: Annotated[float, _DEVIATION] = 100.0
@@ -38,26 +37,24 @@ class PhotometricSettings:
     """The fit of faces to pixels, after the fit to landmarks."""
 
     sizes: Annotated[tuple[int, ...], Range(16, 8192, filled=True)] = (256, 256)
-    """Size of the pictures in each round, in pixels. They are scaled down by the whole number that brings their shorter
-    side nearest to it. The texture is estimated again before each round."""
+    """Size of the pictures in each iteration, in pixels. They are scaled down by the whole number that brings their
+    shorter side nearest to it. The texture is estimated again before each iteration."""
     texture_size: Annotated[int, _TEXELS] = 512
     """Texels along each side of the texture."""
     shared_steps: Annotated[int, COUNT_OR_NONE] = 3
-    """Gauss-Newton steps of identity and focal length before each round but the first."""
+    """Gauss-Newton steps of identity and focal length before each iteration but the first."""
     keyframes: Annotated[int, COUNT] = 24
-    """Timesteps of each sequence for these steps. With several cameras there are fewer, so that the number of pictures
-    is at most about twice this number."""
+    """Timesteps of each sequence for these steps; fewer with several cameras, for at most twice this many pictures."""
     focal_sigma: Annotated[float, POSITIVE] = 0.04
     """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""
     outline_weight: Annotated[float, NOT_NEGATIVE] = 10.0
-    """Weight of the outline of a head against the background in a keyframe; 0 switches it off. It is used only with a
-    single camera, which needs the outline to see perspective."""
+    """Weight of the head's outline in a keyframe; 0 switches it off. Only a single camera needs it, for perspective."""
     independent_pixels: Annotated[float, POSITIVE] = 100.0
-    """Number of independent pixels that all pixels of a picture are worth, because their errors are correlated. It
-    weighs them against landmarks and priors in the steps of identity and focal length, which use many pictures."""
+    """Number of independent pixels that all pixels of a picture are worth in the steps of identity and focal length,
+    because their errors are correlated. It weighs them against landmarks and priors."""
     independent_pixels_of_frames: Annotated[float, POSITIVE] = 50.0
-    """The same number for the steps of frames. If it is much larger, errors of texture, light and shape become
-    expressions, most of which follow the head's turns. If it is much smaller, only landmarks determine the shape."""
+    """The same for the steps of frames. If it is much larger, errors of texture, light and shape become expressions,
+    most of which follow the head's turns. If it is much smaller, only landmarks determine the shape."""
     landmark_share: Annotated[float, FRACTION] = 0.3
     """Weight of landmarks, as a share of their weight in the fit to landmarks alone. Those of lips, lids and irises
     keep their full weight."""
@@ -93,8 +90,7 @@ class PaperSettings:
     shrink: Annotated[int, Range(1, 64)] = 1
     """Factor by which pictures are scaled down for the fit. 2 is four times as fast, and less exact."""
     color_weight: Annotated[float, NOT_NEGATIVE] = 3e3
-    """Weight of the mean colour difference (0..1) between picture and rendering. In the other costs, one squared
-    standard deviation counts 1."""
+    """Weight of the mean colour difference (0..1) to the rendering. A squared standard deviation counts 1."""
     landmark_share: Annotated[float, FRACTION] = 0.3
     """Weight of landmarks, as a share of their weight in the fit to landmarks alone."""
     offset_sigma: Annotated[float, NOT_NEGATIVE] = 0.002
@@ -117,8 +113,7 @@ class TrackingSettings:
     keyframes: Annotated[int, COUNT] = 20
     """Frames of each sequence from which identity is fitted. They are chosen for different head poses."""
     independent_landmarks: Annotated[float, POSITIVE] = 25.0
-    """Number of independent landmarks that all landmarks of a picture are worth, because their errors are correlated.
-    It weighs them against priors and smoothness."""
+    """Number of independent landmarks that all of a picture are worth, because their errors are correlated."""
     identity_weight: Annotated[float, NOT_NEGATIVE] = 4.0
     """Weight of the identity's unit-variance prior."""
     bias_sigma: Annotated[float, POSITIVE] = 0.003

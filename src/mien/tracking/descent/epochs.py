@@ -47,10 +47,7 @@ _AT_ONCE = 16
 
 
 def apply_adam(moments: Moments, values: Tensor, gradient: Tensor, rate: float, settled: float = 1e-12) -> None:
-    """Move the values in place (Kingma and Ba 2015), and update their moments.
-
-    A step is half of `rate` at the gradient `settled`, and nearly all of it far above.
-    """
+    """Move the values in place by Adam (Kingma and Ba 2015). At the gradient `settled` a step is half of `rate`."""
     moments.step += 1
     count = int(moments.step)
     moments.first.lerp_(gradient, 1 - BETA1)

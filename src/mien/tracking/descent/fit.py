@@ -14,7 +14,7 @@ from mien.adam import Moments
 from mien.face.params import most_frontal_camera
 from mien.machine.progress import Advance
 from mien.tracking.descent.epochs import RATES, Descent, apply_adam
-from mien.tracking.descent.scene import PaperScene, PaperState, first_state, paper_scene
+from mien.tracking.descent.scene import PaperScene, first_state, paper_scene
 from mien.tracking.descent.terms import (
     COLOR_EPSILON,
     Target,
@@ -99,31 +99,26 @@ def fit_by_descent(
 
 def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: PhotometricFit | None) -> PhotometricFit:
     """The fit with texture and light. Each texel has the trust of its triangle."""
-    state, fit = descent.state, _as_fit(scene, descent.state, fit)
-    fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
-    trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
-    improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]
-    if refined is not None:
-        improved = [own.clone() for own in refined.improved]
-    for sequence, row in descent.lost:
-        improved[sequence][row] = False
-    appearance = SkinTexture(state.texture, trust, COLOR_EPSILON)
-    return PhotometricFit(fit, appearance, tuple(state.lights), tuple(improved))
-
-
-def _as_fit(scene: PaperScene, state: PaperState, fit: Fit) -> Fit:
-    """The state as a fit to landmarks. The effect of the offsets on landmarks is added to the bias."""
+    state = descent.state
     with torch.no_grad():
-        offsets = state.offsets if scene.settings.offset_sigma > 0 else None
-        moved = scene.landmarks.positions(state.offsets, scene.mesh.faces).double()
-    subject = replace(
-        fit.subject, identity=state.identity.double(), bias=fit.subject.bias + moved, vertex_offsets=offsets
-    )
+        # The effect of the offsets on landmarks is added to the bias.
+        marks = scene.face_model.landmarks["mediapipe"]
+        bias = fit.subject.bias + marks.positions(state.offsets, scene.mesh.faces).double()
+    offsets = state.offsets if scene.settings.offset_sigma > 0 else None
+    subject = replace(fit.subject, identity=state.identity.double(), bias=bias, vertex_offsets=offsets)
     sequences = []
     for own, was, rows in zip(scene.sequences, fit.sequences, state.frames, strict=True):
         factor = 1.0 if own.lens is None else float(state.log_focals[own.lens].exp())
         sequences.append(replace(was, cameras=was.cameras.with_focal(factor), state=rows.double()))
-    return Fit(subject, tuple(sequences))
+    fragments = texture_space(scene.face_model, scene.settings.texture_size).fragments
+    trust = torch.cat([descent.trusted(), torch.zeros(1)])[fragments.face_index.long()]
+    improved = [torch.ones(len(rows), dtype=torch.bool) for rows in state.frames]
+    if refined is not None:
+        improved = [rows.clone() for rows in refined.improved]
+    for sequence, row in descent.lost:
+        improved[sequence][row] = False
+    appearance = SkinTexture(state.texture, trust, COLOR_EPSILON)
+    return PhotometricFit(Fit(subject, tuple(sequences)), appearance, tuple(state.lights), tuple(improved))
 
 
 def fit_appearance(descent: Descent) -> None:
@@ -169,10 +164,7 @@ def _step_appearance(descent: Descent, targets: Sequence[Target], moments: dict[
 
 
 def fit_sequence(descent: Descent, sequence: int, advance: Advance, cache: StageCache) -> None:
-    """Fit the first frame to convergence, then each next frame from the one before it, moved as its landmarks moved.
-
-    If only frames move, each frame is fitted from its own landmarks.
-    """
+    """Fit the first frame to convergence, then each next from the one before, or from its own if only frames move."""
     rows, start = descent.state.frames[sequence], descent.start[sequence]
     before = sum(len(own) for own in descent.state.frames[:sequence])
     for row in range(max(descent.done - before, 0), len(rows)):
@@ -271,10 +263,7 @@ def fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
 
 
 def expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, "t p"]:
-    """The rows for a frame's smoothness: as fitted before it, and as its start says from the frame on.
-
-    With the past alone, heads drifted by degrees.
-    """
+    """The rows for a frame's smoothness: fitted before it, expected from it on. With the past alone, heads drifted."""
     rows, start = descent.state.frames[sequence], descent.start[sequence]
     return torch.cat([rows[: row + 1], descent.bounds.clip(rows[row] + start[row + 1 :] - start[row])])
 

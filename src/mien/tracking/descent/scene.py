@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from mien.camera import Camera
-from mien.face.model import FaceModel, Landmarks
+from mien.face.model import FaceModel
 from mien.render.mesh_gradients import LitMesh, mesh_edges
 from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, Subject
 from mien.tracking.fitting.parameters import ParameterLayout
@@ -78,8 +78,6 @@ class PaperScene:
 
     face_model: FaceModel
     layout: ParameterLayout
-    precision: Float[Tensor, "p p"]
-    landmarks: Landmarks
     bias: Float[Tensor, "l 3"]
     """Bias of the landmarks (`Subject.bias`), float64."""
     mesh: LitMesh
@@ -127,18 +125,15 @@ def paper_scene(problem: Problem, fit: Fit, refined: PhotometricFit | None = Non
         mesh_edges(face_model.faces, used),
     )  # fmt: skip
     return PaperScene(
-        face_model, layout, layout.precision.float(), face_model.landmarks["mediapipe"], fit.subject.bias, mesh,
-        weights, fit.subject.identity.float(), _offset_share(face_model), _neighbors(face_model),
-        _sequences(problem, fit), problem.settings.paper,
+        face_model, layout, fit.subject.bias, mesh, weights, fit.subject.identity.float(), _offset_share(face_model),
+        _neighbors(face_model), _sequences(problem, fit), problem.settings.paper,
     )  # fmt: skip
 
 
 def _sequences(problem: Problem, fit: Fit) -> tuple[SequenceScene, ...]:
     settings, scenes = problem.settings.paper, []
-    parts = zip(
-        problem.data, fit.sequences, problem.lenses, problem.landmark_terms(fit), problem.smoothness(fit), strict=True
-    )
-    for data, sequence, lens, term, smoothness in parts:
+    costs = zip(problem.landmark_terms(fit), problem.smoothness(fit), strict=True)
+    for (data, sequence), lens, (term, smoothness) in zip(problem.pairs(fit), problem.lenses, costs, strict=True):
         cameras, term = sequence.cameras, quiet_landmarks(term, settings.landmark_share)
         scenes.append(SequenceScene(
             data.timesteps, Pictures(data.capture, settings.shrink),

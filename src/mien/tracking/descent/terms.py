@@ -1,7 +1,4 @@
-"""The costs of the `paper` schedule, and what its pictures show of the surface.
-
-One unit of a cost is one squared standard deviation, as in the fit to landmarks.
-"""
+"""The costs of the `paper` schedule, in squared standard deviations, and what its pictures show of the surface."""
 
 import math
 from dataclasses import dataclass, replace
@@ -135,8 +132,8 @@ def landmark_terms(scene: PaperScene, target: Target, moving: Moving) -> Float[T
     own = scene.sequences[target.sequence]
     term, cameras = own.terms[target.row], own.cameras_at(moving.log_focals)
     views = term.views
-    # The effect of the offsets on landmarks is added to the bias, as `_as_fit` does at the end.
-    moved = scene.landmarks.positions(moving.offsets, scene.mesh.faces).double()
+    # The effect of the offsets on landmarks is added to the bias, as at the end of the descent.
+    moved = scene.face_model.landmarks["mediapipe"].positions(moving.offsets, scene.mesh.faces).double()
     cameras = CameraBatch(cameras.K.double(), cameras.viewmat.double())[views.camera]
     state, identity = moving.row.double()[None], moving.identity.double()
     projected = term.model.project(state, identity, scene.bias + moved, cameras, views.row)
@@ -153,7 +150,7 @@ def _gaps(term: LandmarkTerm, residual: Float[Tensor, "n l 2"]) -> Float[Tensor,
 
 def prior_term(scene: PaperScene, row: Float[Tensor, " p"]) -> Float[Tensor, ""]:
     """The prior cost of a timestep's own parameters."""
-    return (row * (scene.precision @ row)).sum()
+    return (row * (scene.layout.precision.float() @ row)).sum()
 
 
 def smoothness_term(
@@ -218,10 +215,7 @@ def guess_texture(scene: PaperScene, target: Target, moving: Moving, texture: Fl
 
 
 def roughness_gradient(texture: Float[Tensor, "th tw 3"]) -> Float[Tensor, "th tw 3"]:
-    """Gradient of the squared differences between neighbouring texels, scaled like the cost of a picture.
-
-    Neighbours differ with a standard deviation of 0.1.
-    """
+    """Gradient of squared differences of neighbouring texels (standard deviation 0.1), scaled like a picture's cost."""
     gradient = torch.zeros_like(texture)
     for axis in (0, 1):
         step = texture.detach().diff(dim=axis)

@@ -26,8 +26,7 @@ class Subject:
 
     identity: Float[Tensor, " i"]
     bias: Float[Tensor, "l 3"]
-    """Offset of each landmark from the model's, at rest, in the head frame, in metres. The detector marks other points
-    than the embedding, and no identity basis spans every face."""
+    """Offset of each landmark from the model's, at rest, in the head frame, in metres: detectors mark other points."""
     vertex_offsets: Float[Tensor, "v 3"] | None = None
     """Static offsets of the mesh, if it was fitted to pixels. The bias then includes their effect on the landmarks."""
     person: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
@@ -100,10 +99,7 @@ def smoothness_of(
     settings: SmoothnessSettings,
     cameras: CameraBatch | None = None,
 ) -> Smoothness:
-    """The smoothness cost over the timesteps with a face. Missing timesteps break the chain.
-
-    A single camera sees depth less well. Without `cameras` it looks along z.
-    """
+    """The smoothness cost over timesteps with a face; gaps break the chain. Without `cameras`, one looks along z."""
     sigmas = torch.full((layout.size,), math.inf, dtype=torch.float64)
     sigmas[:3] = settings.rotation
     along_sight = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -17,12 +17,11 @@ _JOINT_SIGMAS = (
     ("jaw", (0.25, 0.05, 0.03)),
 )
 """Prior standard deviations of joint angles in radians, by a word in the joint's name; 0 fixes an angle. Eyes do not
-roll, a face says nothing about its neck, and a jaw opens (about x), shifts a little (about y) and hardly twists.
-Anatomy."""
+roll, a face says nothing about its neck, and a jaw opens (about x), shifts a little (about y) and hardly twists."""
 _JAW_BOUNDS = (-0.03, 0.6)  # bounds of the jaw's opening angle in radians
 _EYES_ALIKE_SIGMAS = (0.1, 0.03)
-"""Standard deviations of the difference of the two eyes' angles (up-down, left-right), in radians. The eyes look at the
-same thing."""
+"""Standard deviations of the difference of both eyes' angles (up-down, left-right), in radians: they look at one thing.
+"""
 _EXPRESSION_SIGMAS = (
     ("brow", 0.25),
     ("cheek", 0.3),
@@ -98,7 +97,8 @@ def layout_of(face_model: FaceModel) -> ParameterLayout:
     bounds = face_model.expression_bounds.double()
     expression_index = (bounds[:, 0] < bounds[:, 1]).nonzero()[:, 0]
     joint_names = face_model.free_joint_names
-    sigmas = torch.tensor([_joint_sigmas(name) for name in joint_names], dtype=torch.float64).reshape(-1)
+    by_joint = [next((s for word, s in _JOINT_SIGMAS if word in name.lower()), (0.2,) * 3) for name in joint_names]
+    sigmas = torch.tensor(by_joint, dtype=torch.float64).reshape(-1)
     joint_index = (sigmas > 0).nonzero()[:, 0]
     relevant = _joints_behind_landmarks(face_model)
     turns, shifts = face_model.joint_rotation_basis[:, relevant], face_model.joint_translation_basis[:, relevant]
@@ -132,10 +132,6 @@ def _joints_behind_landmarks(face_model: FaceModel) -> list[int]:
         if index in relevant and face_model.joint_parents[index] >= 0:
             relevant.add(face_model.joint_parents[index])
     return sorted(relevant)
-
-
-def _joint_sigmas(name: str) -> tuple[float, float, float]:
-    return next((sigmas for word, sigmas in _JOINT_SIGMAS if word in name.lower()), (0.2, 0.2, 0.2))
 
 
 def _expression_sigmas(face_model: FaceModel) -> Float[Tensor, " e"]:

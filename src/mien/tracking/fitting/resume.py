@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,17 +13,12 @@ from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import say
 
-INTERVAL_SECONDS = 20.0
-"""Least time between two versions of a piece that is replaced again and again."""
-_ENDING = ".safetensors"
+INTERVAL_SECONDS = 20.0  # least time between two versions of a piece that is replaced again and again
 
 
 @dataclass(eq=False)
 class StageCache:
-    """Keeps pieces of a fit by name in a folder of their own. Without a folder it keeps nothing. Mutable.
-
-    A piece must depend on nothing but its name and the fit's input.
-    """
+    """Keeps pieces of a fit, which depend on their name and its input alone, in a folder, if there is one. Mutable."""
 
     folder: Path | None = None
     last: float = field(default_factory=time.monotonic)
@@ -48,12 +44,10 @@ class StageCache:
         path = self._path(name)
         if path is None or not path.is_file():
             return None
-        try:
+        tensors: dict[str, Tensor] = {}
+        with suppress(UserError):
             tensors = read_tensors(path)
-            is_whole = all(bool(tensor.isfinite().all()) for tensor in tensors.values())
-        except UserError:
-            tensors, is_whole = {}, False
-        if not is_whole:
+        if not tensors or not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
             say(f"{path.name}: is damaged, so this part of tracking runs again")
             return None
         if not self.resumed:
@@ -64,7 +58,7 @@ class StageCache:
     def drop(self, beginning: str) -> None:
         """Remove the pieces with names that begin with `beginning`, once their result is kept."""
         if self.folder is not None:
-            for path in self.folder.glob(f"{beginning}*{_ENDING}"):
+            for path in self.folder.glob(f"{beginning}*.safetensors"):
                 path.unlink(missing_ok=True)
 
     def forget(self) -> None:
@@ -73,7 +67,7 @@ class StageCache:
             remove_tree(self.folder)
 
     def _path(self, name: str) -> Path | None:
-        return None if self.folder is None else self.folder / f"{name}{_ENDING}"
+        return None if self.folder is None else self.folder / f"{name}.safetensors"
 
     def write(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write a piece, if there is a folder."""

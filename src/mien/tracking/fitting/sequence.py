@@ -45,7 +45,6 @@ class SequenceData:
     cameras: CameraBatch
     """Cameras in the frame of the fit. In this frame a head that looks into the camera that found most faces has a
     rotation of about zero, so axis-angle rotations stay far from half a turn in any calibrated world."""
-    fps: float
     capture: Capture
     T_world_fit: Float[Tensor, "4 4"] | None
     """Transform from the frame of the fit to the calibrated world; None if they are the same."""
@@ -54,14 +53,6 @@ class SequenceData:
     def timesteps(self) -> Int[Tensor, " v"]:
         """The timesteps with a face."""
         return self.valid.nonzero()[:, 0]
-
-    def cameras_in_world(self, fitted: CameraBatch) -> tuple[Camera, ...]:
-        """The cameras of the tracking: the calibrated ones, or those with the fitted focal length."""
-        if self.capture.calibration is not None:
-            return self.capture.calibration
-        like, size = torch.zeros(()), (self.capture.width, self.capture.height)
-        pairs = zip(fitted.K, fitted.viewmat, strict=True)
-        return tuple(Camera(K, viewmat, *size).to(like) for K, viewmat in pairs)
 
 
 def has_enough_faces(capture: Capture) -> bool:
@@ -80,12 +71,9 @@ def sequence_data(capture: Capture, settings: TrackingSettings) -> SequenceData:
     detected = torch.from_numpy(np.asarray(capture.landmarks, dtype=np.float64))
     seen = _seen(capture)
     valid = seen.any(1)
-    found = int(valid.sum())
-    if found < _MIN_FRAMES:
-        raise UserError(
-            f"{capture.name}: a face was found in {counted(found, 'frame')}, but tracking needs {_MIN_FRAMES}; film "
-            "longer"
-        )
+    if not has_enough_faces(capture):
+        frames = counted(int(valid.sum()), "frame")
+        raise UserError(f"{capture.name}: a face was found in {frames}, but tracking needs {_MIN_FRAMES}; film longer")
     detected = without_flicker(detected, seen)
     row, camera = seen[valid].nonzero().unbind(1)
     views = Views(detected[valid][row, camera], row, camera, torch.ones(len(row), dtype=torch.float64))
@@ -95,7 +83,7 @@ def sequence_data(capture: Capture, settings: TrackingSettings) -> SequenceData:
         batch = batch_of(capture.calibration)
         T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ _FACING
         batch = CameraBatch(batch.K, batch.viewmat @ T_world_fit)
-    return SequenceData(views, valid, batch, capture.fps, capture, T_world_fit)
+    return SequenceData(views, valid, batch, capture, T_world_fit)
 
 
 @contextmanager
@@ -117,10 +105,7 @@ def _seen(capture: Capture) -> Bool[Tensor, "t c"]:
 
 
 def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
-    """The camera of the captured pictures, which may be a scaled crop of the source, in float64.
-
-    The focal length is the given one, or one that is assumed for the whole picture of the source.
-    """
+    """The camera of the captured pictures in float64, with the given focal length or one assumed for the source."""
     crop = capture.source.get("crop", {"width": capture.width, "height": capture.height})
     sides = capture.source.get("picture_size", (crop["width"], crop["height"]))
     assumed = (_CROPPED_FOCAL if max(sides) < _SQUARE * min(sides) else FOCAL) * float(max(sides))

@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-SEGMENT = 1024
-"""Number of blocks of a chain whose factors are in memory at once: about 120 MB for pairs of frames with 60 parameters.
-"""
+SEGMENT = 1024  # blocks of a chain whose factors are in memory at once: about 120 MB for pairs of 60 parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +24,7 @@ class NormalEquations:
         return NormalEquations(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
 
     def split(self, own: int, columns: Int[Tensor, " k"], size: int) -> "tuple[NormalEquations, SharedEquations]":
-        """Split into the frames' own equations and shared ones.
-
-        The first `own` parameters belong to each frame. The other k are the `columns` of `size` shared parameters.
-        """
+        """Split into those of each frame's first `own` parameters and of the rest, `columns` of `size` shared ones."""
         across = self.hessian.new_zeros(len(self.cost), own, size)
         across[:, :, columns] = self.hessian[:, :own, own:]
         hessian, gradient = self.hessian.new_zeros(size, size), self.gradient.new_zeros(size)
@@ -62,10 +57,7 @@ def minimize_frames(
     bounds: Bounds,
     iterations: int,
 ) -> Float[Tensor, "b p"]:
-    """Minimise b independent frames within bounds by Levenberg-Marquardt, each with its own damping.
-
-    Parameters held by a bound take no part in the step (a projected Newton step), and the result is clipped.
-    """
+    """Minimise b independent frames within bounds by projected Levenberg-Marquardt steps, each with its own damping."""
     state = bounds.clip(start)
     damping = state.new_full((len(state),), 1e-3)
     for _ in range(iterations):
@@ -183,10 +175,7 @@ class Smoothness:
         return gradient
 
     def bands(self, state: Float[Tensor, "t p"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Bands of half the Hessian of that quadratic cost along time, [t, p] each.
-
-        They are the diagonal and the first and second upper off-diagonals.
-        """
+        """Diagonal and two upper off-diagonals along time of half the Hessian of that quadratic cost, [t, p] each."""
         weights = self.weights(state)
         before, after, first, second = (torch.zeros_like(weights) for _ in range(4))
         before[1:], after[:-1] = weights[:-1], weights[1:]
@@ -198,10 +187,7 @@ class Smoothness:
 def solve_chain(
     frames: NormalEquations, smoothness: Smoothness, state: Float[Tensor, "t p"], held: Bool[Tensor, "t p"]
 ) -> Float[Tensor, "t p"]:
-    """The Gauss-Newton step of all frames under the smoothness cost, solved by block-tridiagonal elimination.
-
-    Two frames form one block, so second differences couple only neighbouring blocks.
-    """
+    """The Gauss-Newton step of all frames under the smoothness cost, by elimination of blocks of two frames."""
     t, p = state.shape
     moving = (~held).to(state)
     diagonal, first, second = smoothness.bands(state)

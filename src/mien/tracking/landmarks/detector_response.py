@@ -27,10 +27,7 @@ _OF_MEDIAPIPE = ("by_expression", "by_person")
 
 @dataclass(frozen=True, eq=False)
 class DetectorResponse:
-    """Linear model of the offsets of l detected landmarks from the face model's.
-
-    Offsets are in metres, in the head frame at rest, float64.
-    """
+    """Linear model of the offsets of l detected landmarks, in metres, in the head frame at rest, float64."""
 
     mean: Float[Tensor, "l 3"]
     by_turn: Float[Tensor, "2 l 3"]
@@ -78,10 +75,7 @@ def response_path(face_model_name: str, detector: Detector = "mediapipe") -> Pat
 
 
 def read_response(face_model: FaceModel, sigma: float, detector: Detector = "mediapipe") -> DetectorResponse:
-    """Read the response measured for this face model and detector.
-
-    If it was never measured, or on another mesh, only `sigma` is known.
-    """
+    """Read the response measured for a face model and detector. Without one for the mesh, only `sigma` is known."""
     path, of_mediapipe = response_path(face_model.name, detector), response_path(face_model.name)
     landmarks, expressions = len(face_model.landmarks["mediapipe"].faces), len(face_model.expression_names)
     if not (path.is_file() and of_mediapipe.is_file()):

@@ -148,7 +148,7 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Det
         mesh.process(np.zeros((64, 64, 3), np.uint8))
         for _ in track_progress(range(settings.pictures), "Drawing and detecting", settings.pictures):
             vertices = model(random_face(model, generator))[0]
-            camera = _random_camera(settings, generator)
+            camera = _random_camera(settings.size, generator)
             side, up = torch.rand(2, generator=generator).tolist()
             lamp = Headlight(direction=(side - 0.5, -0.3 - 0.5 * up, -1.0), ambient=0.45)
             picture, _ = render_mesh(
@@ -169,12 +169,12 @@ def _draw_and_detect(model: FaceModel, settings: EmbeddingSettings) -> tuple[Det
     return DetectedViews(*(torch.stack(parts) for parts in zip(*views, strict=True))), seen / len(views)
 
 
-def _random_camera(settings: EmbeddingSettings, generator: torch.Generator) -> Camera:
+def _random_camera(size: int, generator: torch.Generator) -> Camera:
     """A camera in front of the head, which fills half of the picture."""
     distance = 0.6 + 0.6 * float(torch.rand((), generator=generator))
     turned = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     viewmat = rigid_transform(turned, torch.tensor([0.0, -0.01, distance]))
-    return camera_from_fov(2 * float(np.arctan(0.17 / (distance - 0.08))), settings.size, settings.size, viewmat)
+    return camera_from_fov(2 * float(np.arctan(0.17 / (distance - 0.08))), size, size, viewmat)
 
 
 def _allowed(model: FaceModel, regions: Sequence[str], seen: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:

@@ -37,9 +37,6 @@ IBUG68 = (
 )  # fmt: skip
 """MediaPipe's landmark for each of 300-W's 68 points. The first 17 are a silhouette there, but fixed points here."""
 
-_CONTOUR = 17
-"""Number of points of `IBUG68` on the contour; they come first."""
-
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
     """Weight of each landmark in a fit. It is 0 for landmarks outside the set, and the mean is 1."""
@@ -54,16 +51,13 @@ def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"
         weights[list(group)] = weight
     if landmarks == "ibug51":
         left_out = torch.ones(LANDMARKS, dtype=torch.bool)
-        left_out[list(IBUG68[_CONTOUR:] + LEFT_IRIS + RIGHT_IRIS)] = False
+        left_out[list(IBUG68[17:] + LEFT_IRIS + RIGHT_IRIS)] = False
         weights[left_out] = 0
     return weights / weights.mean()
 
 
 def rigid_weights() -> Float[Tensor, " l"]:
-    """Weight of each landmark in a fit of the head pose alone.
-
-    Only landmarks that expressions hardly move have a weight, and the mean is 1.
-    """
+    """Weight of each landmark in a fit of the head pose alone: 0 for those that expressions move. The mean is 1."""
     weights = torch.zeros(LANDMARKS, dtype=torch.float64)
     weights[list(NOSE + EYE_CORNERS)] = 1.0
     weights[list(OVAL)] = 0.05

@@ -22,11 +22,9 @@ class Linearization:
     pixels: Float[Tensor, "b l 2"]
     by_frame: Float[Tensor, "b l 2 p"]
     """Derivatives by the per-frame parameters, in the order of the layout."""
-    by_identity: Float[Tensor, "b l 2 i"] | None
-    by_log_focal: Float[Tensor, "b l 2"]
     by_bias: Float[Tensor, "b l 2 3"]
-    by_person: Float[Tensor, "b l 2 k"] | None
-    """Derivatives by the detector's components of a person (`DetectorResponse.by_person`)."""
+    by_shared: Float[Tensor, "b l 2 s"] | None
+    """Derivatives by identity, by `DetectorResponse.by_person`, and by the logarithm of the focal length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,7 @@ class LandmarkModel:
         if self.pose_basis is not None:
             turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
             shaped = shaped + torch.einsum("bq,qklc->bklc", turned.flatten(1), self.pose_basis)
-        transforms = self._joint_transforms(face)
+        transforms = self.face_model.joint_transforms(face)[:, self.joints]
         moved = torch.einsum("bkrc,bklc->blr", transforms[:, :, :3, :3], shaped)
         return moved + torch.einsum("kl,bkc->blc", self.joint_weights, transforms[:, :, :3, 3]), shaped, transforms
 
@@ -103,10 +101,7 @@ class LandmarkModel:
         row: Int[Tensor, " b"],
         with_identity: bool = False,
     ) -> Linearization:
-        """Landmarks in b pictures of v timesteps, with derivatives. Each picture has its timestep `row` and its camera.
-
-        Everything up to the head frame is computed once for each timestep, however many cameras saw it.
-        """
+        """Landmarks in b pictures, with derivatives. The head frame is computed once for each timestep (`row`)."""
         face = self.layout.face_params(state, identity)
         points, shaped, transforms = self.head_points(face, bias)
         rotation = matrix_from_axis_angle(face.head_rotation)
@@ -122,10 +117,13 @@ class LandmarkModel:
         by_expression[..., self.layout.derived_column] += by_derived
         of_head = torch.cat([by_expression, by_angles], dim=-1)
         by_frame = torch.cat([by_rotation, by_world, _chain(by_head, of_head, row)], dim=-1)
-        by_identity = _chain(by_head, self._by_identity(transforms, face), row) if with_identity else None
         by_bias = by_head @ torch.einsum("vkrc,kl->vlrc", transforms[:, :, :3, :3], self.joint_weights)[row]
-        by_person = torch.einsum("blxc,klc->blxk", by_bias, self.response.by_person) if with_identity else None
-        return Linearization(pixels, by_frame, by_identity, by_log_focal, by_bias, by_person)
+        if not with_identity:
+            return Linearization(pixels, by_frame, by_bias, None)
+        by_identity = _chain(by_head, self._by_identity(transforms, face), row)
+        by_person = torch.einsum("blxc,klc->blxk", by_bias, self.response.by_person)
+        by_shared = torch.cat([by_identity, by_person, by_log_focal[..., None]], dim=-1)
+        return Linearization(pixels, by_frame, by_bias, by_shared)
 
     def _by_joint_motion(
         self, transforms: Float[Tensor, "v k 4 4"], shaped: Float[Tensor, "v k l 3"], face: FaceParams
@@ -140,31 +138,20 @@ class LandmarkModel:
         count = len(self.layout.joint_index)
         return motion[..., :count], motion[..., count:]
 
-    def _joint_transforms(self, face: FaceParams) -> Float[Tensor, "v k 4 4"]:
-        return self.face_model.joint_transforms(face)[:, self.joints]
-
     def _by_identity(self, transforms: Float[Tensor, "v k 4 4"], face: FaceParams) -> Float[Tensor, "v l 3 i"]:
         """Derivatives of head-frame points by identity, through the rest shape and through the places of the joints."""
-        by_identity = _through_joints(transforms, self.identity_basis)
-        if self.face_model.joint_identity_basis.any():
-            by_identity = by_identity + torch.einsum(
-                "vkri,kl->vlri", self._shifts_by_identity(face), self.joint_weights
-            )
-        return by_identity
-
-    def _shifts_by_identity(self, face: FaceParams) -> Float[Tensor, "v k 3 i"]:
-        """Derivatives of the k joints' translations by identity.
-
-        A joint that turns points by R about its place p shifts them by p - R p. Its children add their own shifts.
-        """
-        turns = self.face_model.joint_transforms(face)[:, :, :3, :3]
-        places = self.face_model.joint_identity_basis.permute(1, 2, 0)
-        shifts: list[Tensor] = []
+        by_identity, places = _through_joints(transforms, self.identity_basis), self.face_model.joint_identity_basis
+        if not places.any():
+            return by_identity
+        # A joint that turns points by R about its place p shifts them by p - R p. Its children add their own shifts.
+        turns, shifts = self.face_model.joint_transforms(face)[:, :, :3, :3], []
         for joint, parent in enumerate(self.face_model.joint_parents):
             above = torch.eye(3).to(turns) if parent < 0 else turns[:, parent]
-            own = (above - turns[:, joint]) @ places[joint]
+            own = (above - turns[:, joint]) @ places.permute(1, 2, 0)[joint]
             shifts.append(own if parent < 0 else shifts[parent] + own)
-        return torch.stack(shifts, dim=1)[:, self.joints]
+        return by_identity + torch.einsum(
+            "vkri,kl->vlri", torch.stack(shifts, dim=1)[:, self.joints], self.joint_weights
+        )
 
 
 def reduce_face_model(

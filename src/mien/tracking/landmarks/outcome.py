@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -41,7 +42,10 @@ def as_tracking(
             head_translation=face.head_translation @ R_world_fit.T + origin,
         )
     face = face.to(torch.zeros(()))
-    cameras = data.cameras_in_world(own.cameras)
+    cameras, size = data.capture.calibration, (data.capture.width, data.capture.height)
+    if cameras is None:
+        pairs = zip(own.cameras.K, own.cameras.viewmat, strict=True)
+        cameras = tuple(Camera(K, viewmat, *size).to(torch.zeros(())) for K, viewmat in pairs)
     return Tracking(
         face_model=face_model.name,
         face_model_hash=face_model.content_hash,
@@ -56,10 +60,7 @@ def as_tracking(
 
 
 def fill_gaps(face: FaceParams, valid: Bool[Tensor, " t"]) -> FaceParams:
-    """Parameters of all t timesteps from those of the valid ones: linear between neighbours, constant at the ends.
-
-    The rotation of a head in view is far from pi, so axis-angle vectors interpolate like any other parameter.
-    """
+    """Parameters of all timesteps: linear between valid ones (rotations in view are far from pi), constant at ends."""
     assert len(face) == int(valid.sum())
     known = valid.nonzero()[:, 0].numpy()
     every = np.arange(len(valid))
@@ -101,7 +102,9 @@ def without_turn_habits(term: LandmarkTerm, subject: Subject, own: SequenceFit) 
     cancel each other on the face vanish first, and lips that they close stay closed. Poses and joints do not change.
     """
     layout, state = term.model.layout, own.state
-    turns = _independent(state[:, :2])  # The turns up and down, left and right.
+    # An orthonormal basis of the turns up and down, left and right, with fewer columns if the head hardly turns.
+    left, lengths, _ = torch.linalg.svd(state[:, :2] - state[:, :2].mean(0), full_matrices=False)
+    turns = left[:, lengths > _MIN_TURN * len(state) ** 0.5]
     columns = layout.expression_columns
     if turns.shape[1] == 0 or columns.start == columns.stop:
         return own
@@ -113,9 +116,3 @@ def without_turn_habits(term: LandmarkTerm, subject: Subject, own: SequenceFit) 
     changed = state.clone()
     changed[:, columns] = expression - turns @ (following - kept)
     return replace(own, state=layout.bounds.clip(changed))
-
-
-def _independent(turns: Float[Tensor, "v 2"]) -> Float[Tensor, "v q"]:
-    """Orthonormal basis of the turns about their mean. It has fewer columns if the head hardly turns."""
-    left, lengths, _ = torch.linalg.svd(turns - turns.mean(0), full_matrices=False)
-    return left[:, lengths > _MIN_TURN * len(turns) ** 0.5]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from mien.capture.capture import Capture
-from mien.tracking.fitting.fit import Callback, Fit, smoothness_of
+from mien.tracking.fitting.fit import Callback, Fit, SequenceFit, smoothness_of
 from mien.tracking.fitting.resume import StageCache
 from mien.tracking.fitting.sequence import SequenceData
 from mien.tracking.fitting.solver import Smoothness
@@ -34,19 +34,19 @@ class Problem:
         """The number of timesteps with a face, over all sequences."""
         return sum(int(data.valid.sum()) for data in self.data)
 
+    def pairs(self, fit: Fit) -> list[tuple[SequenceData, SequenceFit]]:
+        """The input of each sequence with its fit."""
+        return list(zip(self.data, fit.sequences, strict=True))
+
     def landmark_terms(self, fit: Fit) -> list[LandmarkTerm]:
         """The cost of all landmarks of each sequence, at the depth of a fit."""
-        return [
-            all_landmarks(self.model, data.views, sequence, self.settings)
-            for data, sequence in zip(self.data, fit.sequences, strict=True)
-        ]
+        return [all_landmarks(self.model, data.views, own, self.settings) for data, own in self.pairs(fit)]
 
     def smoothness(self, fit: Fit) -> list[Smoothness]:
         """The smoothness cost of each sequence."""
         layout, settings = self.model.layout, self.settings.smoothness
         return [
-            smoothness_of(layout, data.valid, data.fps, settings, sequence.cameras)
-            for data, sequence in zip(self.data, fit.sequences, strict=True)
+            smoothness_of(layout, data.valid, data.capture.fps, settings, own.cameras) for data, own in self.pairs(fit)
         ]
 
 

@@ -24,10 +24,7 @@ _RIM_BIAS_SHARE = 0.25
 def fit_shared(
     terms: Sequence[LandmarkTerm], fit: Fit, lenses: Sequence[int | None], settings: TrackingSettings
 ) -> Fit:
-    """Fit identity, landmark bias and unknown focal lengths jointly with the keyframes' own parameters.
-
-    Terms and fit are those of the keyframes. `lenses` are those of `Problem`.
-    """
+    """Fit identity, landmark bias and unknown focal lengths jointly with the parameters of the keyframes in `fit`."""
     for _ in range(4):
         fit = _fit_jointly(terms, fit, lenses, settings)
         fit = fit_bias(terms, fit)

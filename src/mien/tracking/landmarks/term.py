@@ -79,16 +79,19 @@ class LandmarkTerm:
         pull = state @ self.model.layout.precision
         return (state * pull).sum(-1), pull
 
+    def _batches(self, size: int, cameras: CameraBatch) -> Iterator[tuple[Views, Tensor, CameraBatch, Tensor]]:
+        """Yield at most `size` pictures at a time, their timesteps (posed once), and the camera and place of each."""
+        for start in range(0, len(self.views.row), size):
+            pictures = self.views.some(slice(start, start + size))
+            rows, place = pictures.row.unique(return_inverse=True)
+            yield pictures, rows, cameras[pictures.camera], place
+
     def _offsets(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> Iterator[tuple[Float[Tensor, "m l 2"], Views]]:
-        """Yield the offsets from detected to projected landmarks, and their pictures, a bounded number at a time."""
-        for start in range(0, len(self.views.row), PROJECTED):
-            pictures = self.views.some(slice(start, start + PROJECTED))
-            # Landmarks of a timestep are posed once for all of its cameras.
-            seen, place = pictures.row.unique(return_inverse=True)
-            batch = cameras[pictures.camera]
-            projected = self.model.project(state[seen], subject.identity, subject.bias, batch, place)
+        """Yield the offsets from detected to projected landmarks, and their pictures."""
+        for pictures, rows, batch, place in self._batches(PROJECTED, cameras):
+            projected = self.model.project(state[rows], subject.identity, subject.bias, batch, place)
             yield projected - pictures.detected, pictures
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
@@ -104,40 +107,35 @@ class LandmarkTerm:
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
     ) -> "Iterator[WeightedLinearization]":
         """Yield linearisations of all pictures, a bounded number at a time."""
-        for start in range(0, len(self.views.row), LINEARIZED):
-            pictures = self.views.some(slice(start, start + LINEARIZED))
-            seen, place = pictures.row.unique(return_inverse=True)
-            batch = cameras[pictures.camera]
-            at = self.model.linearize(state[seen], subject.identity, subject.bias, batch, place, with_identity)
+        for pictures, rows, batch, place in self._batches(LINEARIZED, cameras):
+            at = self.model.linearize(state[rows], subject.identity, subject.bias, batch, place, with_identity)
             residual = at.pixels - pictures.detected
-            cost, weights = self.robust(residual, pictures)
-            yield WeightedLinearization(at, pictures.row, residual, weights, cost)
+            yield WeightedLinearization(at, pictures.row, residual, *self.robust(residual, pictures))
 
-    def equations(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> NormalEquations:
-        """The normal equations of each timestep on its own, with the shared parameters fixed."""
+    def equations(
+        self,
+        state: Float[Tensor, "v p"],
+        subject: Subject,
+        cameras: CameraBatch,
+        shared: SharedEquations | None = None,
+    ) -> NormalEquations:
+        """The normal equations of each timestep on its own. Those of shared parameters are added to `shared`."""
         cost, pull = self._prior(state)
         equations = NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
-        for part in self.linearizations(state, subject, cameras):
+        for part in self.linearizations(state, subject, cameras, with_identity=shared is not None):
             part.add_to(equations)
+            if shared is not None:
+                part.add_to_shared(shared)
         return equations
 
     def joint_equations(
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """The normal equations of each timestep and of the shared parameters.
-
-        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
-        """
-        cost, pull = self._prior(state)
-        equations = NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
+        """The equations of timesteps and of the shared parameters: `Subject.shared`, logarithm of the focal length."""
         size = len(subject.shared) + 1
-        shared = SharedEquations(
-            state.new_zeros(*state.shape, size), state.new_zeros(size, size), state.new_zeros(size)
-        )
-        for part in self.linearizations(state, subject, cameras, with_identity=True):
-            part.add_to(equations)
-            part.add_to_shared(shared)
-        return equations, shared
+        empty = state.new_zeros(*state.shape, size), state.new_zeros(size, size), state.new_zeros(size)
+        shared = SharedEquations(*empty)
+        return self.equations(state, subject, cameras, shared), shared
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +146,8 @@ class WeightedLinearization:
     row: Int[Tensor, " n"]
     """The timestep of each picture."""
     residual: Float[Tensor, "n l 2"]
-    weights: Float[Tensor, "n l"]
     cost: Float[Tensor, " n"]
+    weights: Float[Tensor, "n l"]
 
     def _weighted(self, derivative: Float[Tensor, "n l 2 s"]) -> Float[Tensor, "n m s"]:
         return (derivative * self.weights.sqrt()[:, :, None, None]).flatten(1, 2)
@@ -164,10 +162,8 @@ class WeightedLinearization:
 
     def add_to_shared(self, equations: SharedEquations) -> None:
         """Add the blocks of the shared parameters, in place."""
-        assert self.at.by_identity is not None
-        assert self.at.by_person is not None
-        derivatives = [self.at.by_identity, self.at.by_person, self.at.by_log_focal[..., None]]
-        shared = self._weighted(torch.cat(derivatives, dim=-1))
+        assert self.at.by_shared is not None
+        shared = self._weighted(self.at.by_shared)
         own = self._weighted(self.at.by_frame)
         gradient = shared.mT @ self._weighted(self.residual[..., None])
         equations.across.index_add_(0, self.row, own.mT @ shared)
@@ -207,10 +203,7 @@ def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings
 
 
 def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
-    """The term with a share of its weight, except for lips, lids and irises.
-
-    These keep their weight, because one texture cannot show both an open and a closed mouth.
-    """
+    """The term with a share of its weight, but all of it for lips, lids and irises: no texture shows two mouths."""
     kept = torch.full_like(term.weights, share)
     kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
     return replace(term, weights=term.weights * kept)
@@ -219,9 +212,8 @@ def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
 def trust_of(views: Views, state: Float[Tensor, "v p"], cameras: CameraBatch) -> Float[Tensor, " n"]:
     """Weight of each picture's landmarks, 0..1. It is 1 for the most frontal picture of each timestep.
 
-    In pictures from the side a detector guesses the far half of the face, and its landmarks of the near half change
-    with the view. A single camera is fully trusted, because the effect of turns on landmarks was measured for that case
-    (`DetectorResponse`).
+    From the side, a detector guesses the far half of the face, and its landmarks of the near half change with the view.
+    A single camera is fully trusted, because the effect of turns was measured for that case (`DetectorResponse`).
     """
     ahead = matrix_from_axis_angle(state[:, :3])[views.row, :, 2]
     sight = cameras.centers[views.camera] - state[views.row, 3:6]

@@ -14,8 +14,8 @@ from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.problem import Problem
 from mien.tracking.landmarks.stages import follow_landmarks
 from mien.tracking.pixels.outcome import turn_light
-from mien.tracking.pixels.refine import not_improved, refine_photometrically
-from mien.tracking.pixels.texture import PhotometricFit
+from mien.tracking.pixels.refine import refine_photometrically
+from mien.tracking.pixels.texture import PhotometricFit, photometric_start
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +46,8 @@ def follow_held_out(problem: Problem, others: Sequence[SequenceData], known: Sta
     mean. An unknown focal length is the assumed one, changed as theirs were on average.
     """
 
-    def appearance(fit: Fit, of_others: PhotometricFit) -> PhotometricFit:
-        lights = tuple(mean_light(data, others, of_others.lights) for data in problem.data)
-        return PhotometricFit(fit, of_others.texture, lights, not_improved(fit))
+    def appearance(fit: Fit, shown: PhotometricFit) -> PhotometricFit:
+        return photometric_start(fit, shown.texture, [mean_light(data, others, shown.lights) for data in problem.data])
 
     before = known.landmarks if known.pixels is None else known.pixels.fit
     with explaining_singular(problem.data):

@@ -24,7 +24,8 @@ from mien.tracking.landmarks.problem import Problem, lenses_of
 from mien.tracking.landmarks.stages import fit_landmarks
 from mien.tracking.pipeline.held_out import StageFits, follow_held_out
 from mien.tracking.pixels.outcome import with_pixels
-from mien.tracking.pixels.refine import photometric_start, refine_photometrically
+from mien.tracking.pixels.refine import refine_photometrically
+from mien.tracking.pixels.texture import even_light, photometric_start, unknown_texture
 from mien.tracking.report.preview import DONE, Preview
 from mien.tracking.settings import TrackingSettings
 from mien.tracking.tracking import Tracking
@@ -45,12 +46,11 @@ def track_subject(
     preview: Path | None = None,
     held_out: Sequence[Capture] = (),
 ) -> list[Tracking]:
-    """Fit a face model to landmarks and pixels of all sequences of one person, with one identity.
+    """Fit a face model to all sequences of one person, with one identity. Those of `held_out` are the last of the list.
 
     The stages are: the head pose of every timestep alone; identity (and unknown focal lengths) from keyframes of all
     sequences; every timestep alone; all timesteps of each sequence together, smooth over time; then, unless the
-    schedule is `landmarks`, the fit to pixels (`refine_photometrically`, `fit_by_descent`). The result is
-    deterministic.
+    schedule is `landmarks`, the fit to pixels (`refine_photometrically`, `fit_by_descent`). It is deterministic.
 
     Sequences may differ in size, frame rate and number of cameras. Several cameras must be calibrated
     (`Capture.calibration`). They stay as they are and give the metric scale, and a camera that found no face at a
@@ -68,9 +68,6 @@ def track_subject(
             tracking starts again.
         preview: An .html file that shows the state of the fit. It is written again every few seconds.
         held_out: Further sequences of the person, which are tracked apart.
-
-    Returns:
-        The trackings of `captures`, then those of `held_out`.
     """
     assert captures, "nothing to track"
     settings.check()
@@ -133,7 +130,8 @@ def _fit(problem: Problem) -> StageFits:
         landmarks = fit_landmarks(problem)
     pixels, descent = None, None
     if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
-        pixels = refine_photometrically(problem, photometric_start(problem, landmarks))
+        texture, lights = unknown_texture(settings.photometric.texture_size), [even_light() for _ in problem.data]
+        pixels = refine_photometrically(problem, photometric_start(landmarks, texture, lights))
     if settings.schedule == "paper":
         descent = fit_by_descent(problem, landmarks if pixels is None else pixels.fit, pixels)
     return StageFits(landmarks, pixels, descent)
@@ -147,10 +145,7 @@ def _trackings(face_model: FaceModel, problem: Problem, fits: StageFits) -> list
     refined = None if fits.refined is None else replace(fits.refined, fit=fit)
     if problem.callback is not None:
         problem.callback(DONE, 1.0, lambda: refined or fit)
-    trackings = [
-        as_tracking(problem, face_model, data, fit.subject, sequence)
-        for data, sequence in zip(problem.data, fit.sequences, strict=True)
-    ]
+    trackings = [as_tracking(problem, face_model, data, fit.subject, own) for data, own in problem.pairs(fit)]
     if refined is not None and (refined.texture.trust > 0).any():
         trackings = with_pixels(trackings, problem.data, refined, face_model)
     return trackings

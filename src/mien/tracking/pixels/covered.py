@@ -30,11 +30,11 @@ _LEAST_COSINE = 0.3  # least cosine between the surface's normal and the directi
 _LEAST_SEEN = 0.4  # least share of a part's points that a picture must show
 _LEAST_LIKENESS = 0.35
 """Correlation with the usual look of a part below which something covers it. Measured: a drawn hand reaches 0.29 at
-most. Seven real clips without hands have 0.43 or more, except for one frame of a grimace with 0.22, which `lasting`
+most. Seven real clips without hands have 0.43 or more, except for one frame of a grimace with 0.22, which `_LASTING`
 leaves out."""
 _LASTING = 0.05  # half of the least time that something covers a part, in seconds. A grimace is shorter than a hand
 _LEAST_LASTING = 3
-"""Fewest pictures in a row that something covers. At 25 frames a second it is what `lasting` says; with fewer, one
+"""Fewest pictures in a row that something covers. At 25 frames a second it is what `_LASTING` says; with fewer, one
 grimace or one turn of the head was taken for a hand."""
 _SIMILAR_TURN = 15.0  # angle in degrees between the turns of a head up to which its pictures are compared
 _ALIKE = 0.5  # correlation with the usual look above which a frame has a part in it
@@ -81,8 +81,10 @@ def covered_parts(capture: Capture, tracking: Tracking, face_model: FaceModel) -
             odd = [_unlike(look, *part) for look, part in zip(usual, looks, strict=True)]
         turns = matrix_from_axis_angle(tracking.face.head_rotation[first]).reshape(-1, 9).numpy()
         odd = [_compared(part, weights, turns) for part, (_, weights) in zip(odd, looks, strict=True)]
-        least = max(2 * int(_LASTING * capture.fps) + 1, _LEAST_LASTING)
-        found[first, camera] = torch.from_numpy(_lasting(np.stack(odd, axis=1), least))
+        least = max(2 * int(_LASTING * capture.fps) + 1, _LEAST_LASTING)  # Shorter runs are left out.
+        stacked = np.stack(odd, axis=1).astype(np.uint8)
+        lasting = cv2.morphologyEx(stacked, cv2.MORPH_OPEN, np.ones((least, 1), np.uint8))
+        found[first, camera] = torch.from_numpy(lasting.astype(bool))
     return found
 
 
@@ -121,10 +123,7 @@ def _mean(values: Float[np.ndarray, "n k 3"], weights: Float[np.ndarray, "n k"])
 def the_face(
     look: Float[np.ndarray, "k 3"] | None, values: Float[np.ndarray, "n k 3"], weights: Float[np.ndarray, "n k"]
 ) -> Float[np.ndarray, "k 3"] | None:
-    """The usual look, or None if many pictures are unlike it, but like each other.
-
-    Then a hand rests, or the light changed, and nothing says which of the two looks is the face.
-    """
+    """The usual look, or None if many pictures differ from it alike, because a hand rests or the light changed."""
     odd = _unlike(look, values, weights)
     if look is None or odd.mean() < _MANY:
         return look
@@ -164,11 +163,6 @@ def _compared(
     compared = odd.copy()
     compared[odd] = near.sum(1) >= 5  # fewest usual pictures of a similar turn without which a picture is not judged
     return compared
-
-
-def _lasting(odd: Bool[np.ndarray, "n p"], frames: int) -> Bool[np.ndarray, "n p"]:
-    """The odd pictures of each part without runs that are shorter than an odd number of frames."""
-    return cv2.morphologyEx(odd.astype(np.uint8), cv2.MORPH_OPEN, np.ones((frames, 1), np.uint8)).astype(bool)
 
 
 def _points_of(face_model: FaceModel) -> list[Int[Tensor, " _"]]:

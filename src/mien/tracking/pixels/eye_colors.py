@@ -98,10 +98,7 @@ def eye_crop(
 def _part(
     picture: UInt8[np.ndarray, "h w 3"], camera: Camera, ball: Float[Tensor, "b 3"]
 ) -> tuple[Float[np.ndarray, "ph pw 3"], Bool[np.ndarray, "ph pw"], Camera] | None:
-    """The crop around an eyeball, which of its pixels lie inside the picture, and its camera.
-
-    Returns None if the eyeball is too small, outside the picture, or behind the camera.
-    """
+    """The crop around an eyeball, its pixels inside the picture, and its camera. None if it is too small or unseen."""
     points, depth = camera.project(ball)
     if not (depth > 0).all():
         return None
@@ -148,10 +145,7 @@ def _around(
 def _without_skin(
     colors: Float[np.ndarray, "h w 3"], opening: Bool[np.ndarray, "h w"], skin: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w 3"] | None, float]:
-    """Colours minus the smoothed colour of the skin around an opening, and that skin's own spread about it.
-
-    The colours are None if too little skin is seen.
-    """
+    """Colours minus the smoothed colour of the skin around an opening (None if too little is seen), and its spread."""
     columns = np.flatnonzero(opening.any(axis=0))
     width = max(int(np.ptp(columns)) if len(columns) else 0, 6)
     reach = 2 * max(int(0.3 * width), 3) + 1  # width of the ring of skin around the eye, in widths of the opening
@@ -210,10 +204,7 @@ class EyeColors:
 
 
 def learn_colors(crops: Sequence[EyeCrop]) -> EyeColors | None:
-    """Learn the colours of an eye from pictures, most of which are tracked with about the right position of the lids.
-
-    Returns None if there are too few pixels.
-    """
+    """Learn the colours of an eye from pictures that are mostly tracked right. None if there are too few pixels."""
     inside, beside = (
         np.concatenate([crop.colors[getattr(crop, name)] for crop in crops] or [np.zeros((0, 3), np.float32)])
         for name in ("inside", "beside")

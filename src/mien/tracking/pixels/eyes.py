@@ -48,51 +48,32 @@ class Eye:
 
 
 def eyes_of(model: FaceModel, layout: ParameterLayout) -> list[Eye]:
-    """The eyes that have a coefficient of their own to close the lids. Empty if the model has no eyeballs."""
-    ball = model.region_mask("eyes", "irises")
-    if not ball.any() or len(layout.expression_index) == 0:
+    """The eyes that have a coefficient of their own to close the lids. Empty if the model has no eyeballs.
+
+    Of the free coefficients that can close an eye, it is the one with the least motion elsewhere.
+    """
+    ball, free, eyelids = model.region_mask("eyes", "irises"), layout.expression_index, (RIGHT_EYELIDS, LEFT_EYELIDS)
+    if not ball.any() or len(free) == 0:
         return []
-    closing = [_closing(model, layout, pairs) for pairs in (RIGHT_LID_PAIRS, LEFT_LID_PAIRS)]
-    marks = model.landmark_positions(model.template, "mediapipe")
-    middles = torch.stack([marks[list(lids)].mean(0) for lids in (RIGHT_EYELIDS, LEFT_EYELIDS)])
-    centers = model.template[model.faces].mean(1)
-    nearest = torch.cdist(centers, middles).argmin(1)
-    eyes = []
-    for number, lids in enumerate((RIGHT_EYELIDS, LEFT_EYELIDS)):
-        found = _coefficient(model, layout, closing[number], closing[1 - number], lids)
-        own = ball & (nearest == number)
-        if found is not None and own.any():
-            eyes.append(_eye(model, layout, own, middles[number], *found))
+    marks, bounds = model.landmark_positions(model.template, "mediapipe"), model.expression_bounds[free]
+    moved, closing = model.landmark_positions(model.expression_basis[free], "mediapipe"), []
+    for pairs in (RIGHT_LID_PAIRS, LEFT_LID_PAIRS):
+        # The share of the mean person's gap between the lids that each coefficient closes, per unit.
+        upper, lower = (list(side) for side in zip(*pairs, strict=True))
+        gap, change = marks[upper] - marks[lower], moved[:, upper] - moved[:, lower]
+        closing.append(-((change * gap).sum(-1) / (gap**2).sum(-1)).mean(1))
+    middles = torch.stack([marks[list(lids)].mean(0) for lids in eyelids])
+    nearest, eyes = torch.cdist(model.template[model.faces].mean(1), middles).argmin(1), []
+    for number, lids in enumerate(eyelids):
+        own, share = ball & (nearest == number), closing[number]
+        able = (share * _MOST_CLOSING * bounds[:, 1] >= 1) & (closing[1 - number].abs() < _OTHERS_SHARE * share)
+        if able.any() and own.any():
+            elsewhere = torch.ones(moved.shape[1], dtype=torch.bool)
+            elsewhere[list(lids)] = False
+            cost = (moved[:, elsewhere] ** 2).sum((1, 2)) / share**2
+            index = int(cost.where(able, torch.inf).argmin())
+            eyes.append(_eye(model, layout, own, middles[number], index, float(bounds[index, 1])))
     return eyes
-
-
-def _closing(model: FaceModel, layout: ParameterLayout, pairs: tuple[tuple[int, int], ...]) -> Float[Tensor, " n"]:
-    """The share of the mean person's gap between the lids that each free coefficient closes, per unit."""
-    upper, lower = (list(side) for side in zip(*pairs, strict=True))
-    marks = model.landmark_positions(model.template, "mediapipe")
-    moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
-    gap, change = marks[upper] - marks[lower], moved[:, upper] - moved[:, lower]
-    return -((change * gap).sum(-1) / (gap**2).sum(-1)).mean(1)
-
-
-def _coefficient(
-    model: FaceModel,
-    layout: ParameterLayout,
-    closing: Float[Tensor, " n"],
-    of_other: Float[Tensor, " n"],
-    lids: tuple[int, ...],
-) -> tuple[int, float] | None:
-    """The free coefficient that closes an eye with the least motion elsewhere, and its upper bound; or None."""
-    bounds = model.expression_bounds[layout.expression_index]
-    able = (closing * _MOST_CLOSING * bounds[:, 1] >= 1) & (of_other.abs() < _OTHERS_SHARE * closing)
-    if not able.any():
-        return None
-    moved = model.landmark_positions(model.expression_basis[layout.expression_index], "mediapipe")
-    elsewhere = torch.ones(moved.shape[1], dtype=torch.bool)
-    elsewhere[list(lids)] = False
-    cost = (moved[:, elsewhere] ** 2).sum((1, 2)) / closing**2
-    index = int(cost.where(able, torch.inf).argmin())
-    return index, float(bounds[index, 1])
 
 
 def _eye(

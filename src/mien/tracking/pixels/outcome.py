@@ -76,20 +76,22 @@ def model_pictures(capture: Capture, tracking: Tracking, face_model: FaceModel) 
 
 
 def with_pixels(
-    trackings: Sequence[Tracking],
-    sequences: Sequence[SequenceData],
-    refined: PhotometricFit,
-    face_model: FaceModel,
+    trackings: Sequence[Tracking], sequences: Sequence[SequenceData], refined: PhotometricFit, face_model: FaceModel
 ) -> list[Tracking]:
     """The trackings with the results of the fit to pixels: appearance, pixel residuals, and parts that are covered."""
     complete = []
     for index, (tracking, data) in enumerate(zip(trackings, sequences, strict=True)):
-        tracking = replace(
-            tracking, appearance=appearance_in_world(refined.texture, refined.lights[index], data.T_world_fit)
-        )
-        found = refined.residuals[index] if refined.residuals else _residuals(tracking, data, face_model)
-        found = found.where(refined.improved[index][:, None], torch.nan)
-        tracking = _with_pixel_residuals(tracking, data, found)
+        appearance = appearance_in_world(refined.texture, refined.lights[index], data.T_world_fit)
+        tracking = replace(tracking, appearance=appearance)
+        of_faces = refined.residuals[index] if refined.residuals else _residuals(tracking, data, face_model)
+        residuals = torch.full_like(tracking.residuals, torch.nan)
+        residuals[data.valid] = of_faces.where(refined.improved[index][:, None], torch.nan)
+        left = (data.valid & residuals.isnan().all(1)).nonzero()[:, 0].tolist()
+        if left:
+            some = ", ".join(map(str, left[:8])) + (", ..." if len(left) > 8 else "")
+            say(f"{data.capture.name}: the fit to pixels did not improve {len(left)} of {int(data.valid.sum())} frames "
+                f"with a face. They keep their fit to landmarks: {some}")  # fmt: skip
+        tracking = replace(tracking, pixel_residuals=residuals)
         covered = covered_parts(data.capture, tracking, face_model)
         complete.append(replace(tracking, covered=covered) if covered.any() else tracking)
     return complete
@@ -97,29 +99,17 @@ def with_pixels(
 
 def _residuals(tracking: Tracking, data: SequenceData, face_model: FaceModel) -> Float[Tensor, "v c"]:
     """Colour differences of the pictures with a face (`Comparison.rms`); NaN where a camera found none."""
-    pictures = model_pictures(data.capture, tracking, face_model)
+    pictures, timesteps = model_pictures(data.capture, tracking, face_model), data.timesteps.tolist()
     assert pictures is not None
-    found = torch.full((int(data.valid.sum()), len(tracking.cameras)), torch.nan)
-    timesteps, views = data.timesteps.tolist(), data.views
+    residuals = torch.full((len(timesteps), len(tracking.cameras)), torch.nan)
 
     def compare(row: int) -> None:
         vertices = face_model(tracking.face[timesteps[row]])[0]
-        for camera in views.seen_by(row):
-            found[row, camera] = pictures.compare(timesteps[row], camera, vertices).rms
+        for camera in data.views.seen_by(row):
+            residuals[row, camera] = pictures.compare(timesteps[row], camera, vertices).rms
 
-    map_in_threads(compare, list(range(len(found))))
-    return found
-
-
-def _with_pixel_residuals(tracking: Tracking, data: SequenceData, found: Float[Tensor, "v c"]) -> Tracking:
-    residuals = torch.full_like(tracking.residuals, torch.nan)
-    residuals[data.valid] = found
-    left = (data.valid & residuals.isnan().all(1)).nonzero()[:, 0].tolist()
-    if left:
-        some = ", ".join(map(str, left[:8])) + (", ..." if len(left) > 8 else "")
-        say(f"{data.capture.name}: the fit to pixels did not improve {len(left)} of {int(data.valid.sum())} frames "
-            f"with a face. They keep their fit to landmarks: {some}")  # fmt: skip
-    return replace(tracking, pixel_residuals=residuals)
+    map_in_threads(compare, list(range(len(timesteps))))
+    return residuals
 
 
 def appearance_in_world(
@@ -132,10 +122,7 @@ def appearance_in_world(
 
 
 def turn_light(light: Float[Tensor, "9 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "9 3"]:
-    """The spherical harmonics of the same light in a turned frame.
-
-    The result shades a turned normal as `light` shades the normal itself.
-    """
+    """The spherical harmonics of the same light in a turned frame: they shade turned normals as `light` the normals."""
     normals = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     turned = sh_basis(normals.double() @ rotation.double().T)
     # Rotations map the harmonics of each degree to themselves, so the fit is exact.

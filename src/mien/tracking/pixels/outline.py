@@ -69,10 +69,7 @@ class OutlineTerm:
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """The normal equations of some timesteps and of the shared parameters.
-
-        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
-        """
+        """The equations of timesteps and of the shared parameters: `Subject.shared`, logarithm of the focal length."""
         whole = equations_of_pictures(
             self.model, self.views, state, rows, subject, cameras, self.weight, self._of_picture, shared=True
         )

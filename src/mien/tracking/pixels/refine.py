@@ -29,10 +29,8 @@ from mien.tracking.pixels.texture import (
     SurfaceView,
     TextureSpace,
     estimate_appearance,
-    even_light,
     photometric_fit_of,
     texture_space,
-    unknown_texture,
 )
 
 _FRAME_DAMPING = 1e-3  # damping of a frame's step, as a share of the diagonal
@@ -84,22 +82,16 @@ class _PixelProblem:
         surface = self.space.native(at.texture, self.problem.settings.photometric.outlier)
         return [
             PhotometricTerm(
-                self.model, marks, self.pictures(data), data.timesteps, surface, light,
-                self.light_radius(data, sequence), independent_pixels, at.texture.sigma,
+                self.model, marks, self.pictures(data), data.timesteps, surface, light, self.light_radius(data, own),
+                independent_pixels, at.texture.sigma,
             )
-            for data, marks, sequence, light in zip(
-                self.problem.data, self.landmarks, at.fit.sequences, at.lights, strict=True
-            )
+            for (data, own), marks, light in zip(self.problem.pairs(at.fit), self.landmarks, at.lights, strict=True)
         ]  # fmt: skip
 
     def update_appearance(self, at: PhotometricFit) -> PhotometricFit:
         """Estimate texture and light again, from the present positions of the faces."""
-        views = [
-            self._views(data, marks, sequence, at.fit.subject.identity, light)
-            for data, marks, sequence, light in zip(
-                self.problem.data, self.landmarks, at.fit.sequences, at.lights, strict=True
-            )
-        ]
+        identity, pairs = at.fit.subject.identity, self.problem.pairs(at.fit)
+        views = [self._views(*pair, identity, light) for pair, light in zip(pairs, at.lights, strict=True)]
         radius = self.light_radius(self.problem.data[0], at.fit.sequences[0])
         outlier = self.problem.settings.photometric.outlier
         texture, lights = estimate_appearance(self.space, views, at.texture, outlier, radius)
@@ -115,12 +107,7 @@ class _PixelProblem:
         return replace(at, fit=fit_bias(self.landmarks, moved))
 
     def _views(
-        self,
-        data: SequenceData,
-        landmarks: LandmarkTerm,
-        sequence: SequenceFit,
-        identity: Float[Tensor, " i"],
-        light: Float[Tensor, "9 3"],
+        self, data: SequenceData, sequence: SequenceFit, identity: Float[Tensor, " i"], light: Float[Tensor, "9 3"]
     ) -> list[SurfaceView]:
         """The pictures of a sequence that the texture is estimated from."""
         pictures, state, cameras = self.pictures(data), sequence.state, sequence.cameras
@@ -132,7 +119,7 @@ class _PixelProblem:
             timestep, share = int(data.timesteps[row]), float(shares[row])
             return [
                 SurfaceView(posed, pictures.picture(timestep, camera, cameras), light, share)
-                for camera in landmarks.views.seen_by(row)
+                for camera in data.views.seen_by(row)
             ]
 
         count = min(48, len(state))  # frames of each sequence that the texture is estimated from
@@ -147,18 +134,6 @@ class _PixelProblem:
             for term, sequence, improved in zip(terms, at.fit.sequences, at.improved, strict=True)
         ]
         return replace(at, residuals=tuple(residuals))
-
-
-def photometric_start(problem: Problem, fit: Fit) -> PhotometricFit:
-    """A fit to landmarks before any pixel is seen: without a texture, in even light."""
-    size = problem.settings.photometric.texture_size
-    lights = tuple(even_light() for _ in problem.data)
-    return PhotometricFit(fit, unknown_texture(size), lights, not_improved(fit))
-
-
-def not_improved(fit: Fit) -> tuple[Bool[Tensor, " _"], ...]:
-    """`PhotometricFit.improved` of a fit that saw no pixel yet."""
-    return tuple(torch.zeros(len(sequence.state), dtype=torch.bool) for sequence in fit.sequences)
 
 
 def refine_photometrically(problem: Problem, start: PhotometricFit, known_person: bool = False) -> PhotometricFit:

@@ -69,7 +69,10 @@ class SurfaceModel:
         by_translation = torch.eye(3).expand(len(turned), 3, 3)
         by_expression = self.expression_basis
         by_transforms, by_turns = joint_derivatives(self.layout, self.exact, exact)
-        angles, motion = len(self.layout.joint_index), self._skinned(by_transforms[:, 0].float(), shaped)
+        angles, points = len(self.layout.joint_index), torch.cat([shaped, shaped.new_ones(len(shaped), 1)], dim=1)
+        weighted = (self.face_model.skinning_weights[:, :, None] * points[:, None]).flatten(1)
+        by_transforms = by_transforms[:, 0].float().permute(1, 3, 2, 0).flatten(0, 1)
+        motion = (weighted @ by_transforms.flatten(1)).reshape(-1, *by_transforms.shape[1:])
         parts = [_apply(rotation @ turns, by_expression), _rotate(rotation, motion[..., :angles])]
         parts[0][:, :, self.layout.derived_column] += _rotate(rotation, motion[..., angles:])
         basis = self.face_model.pose_basis
@@ -89,12 +92,6 @@ class SurfaceModel:
             turned = matrix_from_axis_angle(face.joints) - torch.eye(3)
             shaped = shaped + (turned.flatten() @ model.pose_basis.flatten(1)).reshape(-1, 3)
         return shaped
-
-    def _skinned(self, by_transforms: Float[Tensor, "n k 3 4"], shaped: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 n"]:
-        n, k = by_transforms.shape[:2]
-        points = torch.cat([shaped, shaped.new_ones(len(shaped), 1)], dim=1)
-        weighted = (self.face_model.skinning_weights[:, :, None] * points[:, None]).flatten(1)
-        return (weighted @ by_transforms.permute(1, 3, 2, 0).reshape(k * 4, 3 * n)).reshape(-1, 3, n)
 
 
 def surface_model(face_model: FaceModel, layout: ParameterLayout) -> SurfaceModel:
@@ -154,10 +151,7 @@ def equations_of_pictures(
 
 
 def _by_log_focal(vertices: Float[Tensor, "v 3"], cameras: CameraBatch, seen_by: list[int]) -> Float[Tensor, "v 3 1"]:
-    """Motion of vertices across the line of sight that looks like a change of the focal length, per log focal length.
-
-    It is zero if several cameras see the timestep.
-    """
+    """Motion of vertices that looks like a change of the log of the focal length; zero if several cameras see them."""
     if len(seen_by) != 1:
         return torch.zeros(len(vertices), 3, 1)  # Several cameras are calibrated.
     viewmat = cameras.viewmat[seen_by[0]].float()

@@ -83,10 +83,7 @@ class PhotometricTerm:
     def joint_equations(
         self, state: Float[Tensor, "v p"], rows: Int[Tensor, " k"], subject: Subject, cameras: CameraBatch
     ) -> tuple[NormalEquations, SharedEquations]:
-        """The normal equations of some timesteps and of the shared parameters.
-
-        The shared parameters are `Subject.shared`, then the logarithm of the focal length.
-        """
+        """The equations of timesteps and of the shared parameters: `Subject.shared`, logarithm of the focal length."""
         marks, shared = self.landmarks.at(rows).joint_equations(state[rows], subject, cameras)
         pixels = self._pixel_equations(state, rows, subject, cameras, shared=True)
         own, of_pixels = pixels.split(state.shape[1], subject.columns_of_pixels, len(subject.shared) + 1)

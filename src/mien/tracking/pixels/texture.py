@@ -1,7 +1,4 @@
-"""The subject's skin as a texture and the light of each sequence, from pictures with roughly tracked faces.
-
-`PhotometricFit` is a fit with both.
-"""
+"""The subject's skin as a texture and the light of each sequence, from pictures with roughly tracked faces."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -104,11 +101,9 @@ def estimate_appearance(
 ) -> tuple[SkinTexture, list[Float[Tensor, "9 3"]]]:
     """Estimate the albedo in turn with the light of every sequence.
 
-    The albedo is a least squares fit for each texel, which is robust from the second round on.
-
-    The views of each sequence have its light known so far, and `start` has the texture; its sigma scales the robust
-    weights, which fade beyond `outlier` sigmas. What is smooth over `light_radius` pixels counts as light and is left
-    out of the texture.
+    The albedo is a least squares fit for each texel, which is robust from the second round on. The views of each
+    sequence have its light known so far, and `start` has the texture; its sigma scales the robust weights, which fade
+    beyond `outlier` sigmas. What is smooth over `light_radius` pixels counts as light and is left out of the texture.
     """
     texture, known = start, bool((start.trust > 0).any())
     for turn in range(3):  # number of rounds of albedo and light in turn
@@ -119,8 +114,8 @@ def estimate_appearance(
             # The median colour in all known texels: at the start, all variation counts as light.
             median, seen = texture.albedo[texture.trust > 0].median(0).values, texture.trust > 0
             texture = replace(texture, albedo=seen[..., None] * median, sigma=_FIRST_SIGMA)
-        surface = space.native(texture, outlier)
-        views = [_relit(surface, own) for own in views]
+        views = [_relit(space.native(texture, outlier), own) for own in views]
+    surface = space.native(texture, outlier)
     even = [[_without_smooth_residual(surface, view, light_radius) for view in own] for own in views]
     return _bake(space, even, texture, outlier), [own[0].light for own in views]
 
@@ -186,6 +181,12 @@ class PhotometricFit:
         for index, (light, improved) in enumerate(zip(self.lights, self.improved, strict=True)):
             tensors |= {f"light_{index}": light, f"improved_{index}": improved.to(torch.uint8)}
         return tensors
+
+
+def photometric_start(fit: Fit, texture: SkinTexture, lights: Sequence[Float[Tensor, "9 3"]]) -> PhotometricFit:
+    """A fit to landmarks with the texture and lights from which it will be fitted to pixels."""
+    improved = tuple(torch.zeros(len(sequence.state), dtype=torch.bool) for sequence in fit.sequences)
+    return PhotometricFit(fit, texture, tuple(lights), improved)
 
 
 def photometric_fit_of(tensors: Mapping[str, Tensor]) -> PhotometricFit:

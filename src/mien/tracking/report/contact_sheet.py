@@ -39,7 +39,8 @@ def sheet_frames(tracking: Tracking, flagged: Sequence[int], alone: Sequence[int
     chosen = {timestep: SheetFrame(timestep, frontal) for timestep in even}
     if 2 * len(alone) < len(valid):
         for timestep in alone[:: max(len(alone) // _MAX_ALONE, 1)][:_MAX_ALONE]:
-            chosen[timestep] = SheetFrame(timestep, _camera_of_face(tracking.residuals[timestep]), "landmarks only")
+            camera = int(tracking.residuals[timestep].isfinite().int().argmax())  # the first that found a face
+            chosen[timestep] = SheetFrame(timestep, camera, "landmarks only")
     worst = tracking.residuals if tracking.pixel_residuals is None else tracking.pixel_residuals
     size = worst.nan_to_num(-1).amax(1)
     for timestep in worst_of_runs(flagged, size.numpy())[:_MAX_FLAGGED]:
@@ -58,8 +59,7 @@ def worst_of_runs(timesteps: Sequence[int], values: Float[np.ndarray, " t"]) -> 
 def write_overlay_sheet(path: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
     """Write at most six pictures in a row, cut to the head, with the mesh over the same pictures below them.
 
-    Timesteps are evenly spread, and so are cameras, beginning with the frontal one. They are few, so an
-    import writes it for every sequence.
+    Timesteps and cameras are evenly spread, beginning with the frontal camera.
     """
     painter, cameras = OverlayPainter(capture, tracking, face_model), len(tracking.cameras)
     valid, frontal = tracking.valid.nonzero()[:, 0], frontal_camera(tracking)
@@ -85,8 +85,3 @@ def tiles_of(painter: OverlayPainter, capture: Capture, frame: SheetFrame) -> li
     rows, columns = painter.head_box(frame.timestep, frame.camera)
     panels = [image, *painter.panels(frame.timestep, frame.camera)[1:]]
     return [cv2.resize(panel[rows, columns], (_TILE, _TILE), interpolation=cv2.INTER_AREA) for panel in panels]
-
-
-def _camera_of_face(residuals: Float[torch.Tensor, " c"]) -> int:
-    """The first camera that found a face; the first of all if none did."""
-    return int(residuals.isfinite().int().argmax())

@@ -1,7 +1,6 @@
 """The overlay video, which shows whether the tracked mesh fits the pictures, and heat maps of colour differences."""
 
 import math
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -42,8 +41,10 @@ def write_overlay(path: Path, capture: Capture, tracking: Tracking, face_model: 
     If `every` is n, it shows every n-th timestep at 1/n of the frame rate, so it lasts as long as the capture. Several
     cameras form a grid, in the order of the capture, which is scaled down to at most 1920 pixels across.
     """
+    painter, timesteps = OverlayPainter(capture, tracking, face_model), range(0, capture.timesteps, every)
+    pictures = stream_in_threads(partial(_grid, painter, len(tracking.cameras)), timesteps)
     # Quality that is enough for viewing takes a quarter of the time of `write_video`'s defaults.
-    write_video(path, _pictures(capture, tracking, face_model, every), capture.fps / every, 21, "veryfast")
+    write_video(path, track_progress(pictures, "Overlay", len(timesteps)), capture.fps / every, 21, "veryfast")
 
 
 def overlay_stride(timesteps: int) -> int:
@@ -56,7 +57,8 @@ class OverlayPainter:
 
     def __init__(self, capture: Capture, tracking: Tracking, face_model: FaceModel) -> None:
         self._capture, self._tracking, self._face_model = capture, tracking, face_model
-        self._colors = region_colors(face_model)
+        palette = torch.tensor([_REGION_COLORS.get(name, (0.8, 0.78, 0.75)) for name in face_model.region_names])
+        self._colors = palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
         self._neck = NeckParts.of(face_model)
         self._models = model_pictures(capture, tracking, face_model)
         self._from_front = seen_from_front(tracking)
@@ -156,7 +158,7 @@ class OverlayPainter:
         known = np.isfinite(difference)[..., None]
         own = (255 * compared.image.nan_to_num(0).clamp_(0, 1)).to(torch.uint8).numpy()
         panels = [behind, behind.copy()]
-        for panel, drawn in zip(panels, (own, heat_map(difference)), strict=True):
+        for panel, drawn in zip(panels, (own, heat_colors(difference, HOTTEST)), strict=True):
             np.copyto(panel[part], drawn, where=known)
         return panels
 
@@ -164,12 +166,6 @@ class OverlayPainter:
 def frontal_camera(tracking: Tracking) -> int:
     """The index of the camera that the tracked face looks at most directly."""
     return most_frontal_camera(tracking.cameras, tracking.face[tracking.valid])
-
-
-def region_colors(face_model: FaceModel) -> Float[torch.Tensor, "f 3 3"]:
-    """Colours of the corners of every triangle, which tell lips, lids, irises, ears and other regions apart."""
-    palette = torch.tensor([_REGION_COLORS.get(name, (0.8, 0.78, 0.75)) for name in face_model.region_names])
-    return palette[face_model.face_regions.long()][:, None].expand(-1, 3, -1)
 
 
 def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -190,24 +186,11 @@ def _grid(painter: OverlayPainter, cameras: int, timestep: int) -> UInt8[np.ndar
     return grid
 
 
-def _pictures(
-    capture: Capture, tracking: Tracking, face_model: FaceModel, every: int
-) -> Iterator[UInt8[np.ndarray, "h w2 3"]]:
-    painter, timesteps = OverlayPainter(capture, tracking, face_model), range(0, capture.timesteps, every)
-    pictures = stream_in_threads(partial(_grid, painter, len(tracking.cameras)), timesteps)
-    yield from track_progress(pictures, "Overlay", len(timesteps))
-
-
 def draw_points(image: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "l 2"], color: tuple) -> None:
     """Draw landmarks as discs."""
     bits = 4  # of OpenCV's fixed-point format, with pixel centres at whole numbers
     for x, y in np.round(np.clip((points - 0.5) * (1 << bits), -(2**28), 2**28)).astype(np.int32).tolist():
         cv2.circle(image, (x, y), 1 << bits, color, -1, cv2.LINE_AA, bits)
-
-
-def heat_map(difference: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Differences in the colours of `inferno`. Black is no difference, or an unknown one (NaN)."""
-    return heat_colors(difference, HOTTEST)
 
 
 def draw_legend(picture: UInt8[np.ndarray, "h w 3"], top: int) -> None:

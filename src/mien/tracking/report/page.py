@@ -50,10 +50,7 @@ _WAYS = {
 
 
 def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, face_model: FaceModel) -> str:
-    """Write residuals.json and report.html into `folder` and return the main findings as text.
-
-    Except for the overlay video, the page is complete in one file.
-    """
+    """Write residuals.json and report.html (complete but for the video) into `folder`. Return the findings as text."""
     report = residual_report(capture, tracking, face_model)
     write_json(folder / "residuals.json", "mien.residual_report", 1, report)
     painter = OverlayPainter(capture, tracking, face_model)
@@ -66,8 +63,9 @@ def write_residual_report(folder: Path, capture: Capture, tracking: Tracking, fa
         name=capture.name,
         poster=poster,
         findings=findings(tracking, report),
-        tiles=_tiles(report),
-        figures=_figures(report),
+        report=report,
+        number=_number,
+        focal_from=_FOCAL_FROM[report["focal_from"]],
         rows=rows,
         hottest=f"{100 * HOTTEST:.0f} %",
         charts=_charts(capture, tracking, face_model, report),
@@ -176,40 +174,6 @@ def name_runs(timesteps: Sequence[int]) -> str:
             runs.append([timestep, timestep])
     parts = [str(first) if first == last else f"{first}-{last}" for first, last in runs]
     return ", ".join(parts[:_SOME]) + (", ..." if len(parts) > _SOME else "")
-
-
-def _tiles(report: dict[str, Any]) -> list[tuple[str, str]]:
-    """The few figures to read first, each with its name."""
-    colors, flagged = report["residual_colors"], len(report["flagged_frames"])
-    tiles = [
-        (str(report["frames"]), "frames"),
-        (_number(report["residual_px"]["median"], 1, "px"), "landmarks, median"),
-    ]
-    if colors is not None:
-        tiles.append((_number(colors["median"], 100, "%"), "difference of colours, median"))
-    return [*tiles, (str(flagged), "frame stands out" if flagged == 1 else "frames stand out")]
-
-
-def _figures(report: dict[str, Any]) -> list[tuple[str, str]]:
-    colors, iris = report["residual_colors"], report["iris_distance"]
-    rows = [
-        ("Distance of landmarks from the detected ones: median, 95 %, largest", _three(report["residual_px"], 1, "px")),
-    ]
-    if colors is not None:
-        rows.append(("Difference of colours: median, 95 %, largest", _three(colors, 100, "%")))
-    rows += [
-        ("Focal length", f"{report['focal_px']:.0f} px, {_FOCAL_FROM[report['focal_from']]}"),
-        ("Distance from the camera: median", _number(report["depth_m"]["median"], 1, "m")),
-        ("Jitter of landmarks: detected, fitted", f"{_number(report['jitter']['detected_px'], 1, 'px')}, "
-                                                  f"{_number(report['jitter']['fitted_px'], 1, 'px')}"),
-        ("Distance of the irises: mean, deviation", f"{_number(iris['mean_m'], 1000, 'mm')}, "
-                                                    f"{_number(iris['deviation_percent'], 1, '%')}"),
-    ]  # fmt: skip
-    return rows
-
-
-def _three(summary: dict[str, float | None], factor: int, unit: str) -> str:
-    return ", ".join(_number(summary[name], factor, unit) for name in ("median", "p95", "max"))
 
 
 def _number(value: float | None, factor: int, unit: str) -> str:

@@ -124,10 +124,8 @@ class _Sample:
     """Some timesteps of a sequence as a sequence of their own. Immutable."""
 
     def __init__(self, data: SequenceData, count: int) -> None:
-        self.frames = len(data.valid)
-        self.rows: Int[torch.Tensor, " k"] = (
-            torch.linspace(0, len(data.timesteps) - 1, min(count, len(data.timesteps))).round().long()
-        )
+        self.frames, faces = len(data.valid), len(data.timesteps)
+        self.rows: Int[torch.Tensor, " k"] = torch.linspace(0, faces - 1, min(count, faces)).round().long()
         self.timesteps: list[int] = data.timesteps[self.rows].tolist()
         whole, chosen = data.capture, self.timesteps
         capture = replace(

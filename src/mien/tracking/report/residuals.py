@@ -48,14 +48,21 @@ def residual_report(capture: Capture, tracking: Tracking, face_model: FaceModel)
     seen = tracking.residuals[:, frontal].isfinite()
     pitch, yaw, _ = seen_rotation(tracking, frontal).unbind(1)
     iris = iris_distances(tracking, detected[:, frontal], depth, frontal)
+    flagged, alone, colors, covered = flagged_frames(timestep_residuals(tracking)), valid, tracking.pixel_residuals, {}
+    if colors is not None:
+        flagged |= flagged_frames(colors.nanmedian(1).values, _MIN_COLOR_STEP)
+        alone = valid & colors.isnan().all(1)
+    if tracking.covered is not None:
+        by_part = {name: tracking.covered[:, :, part].any(1) for part, name in enumerate(PARTS)}
+        covered = {name: frames.nonzero()[:, 0].tolist() for name, frames in by_part.items() if frames.any()}
     return {
         "frames": len(valid),
         "frames_without_face": (~valid).nonzero()[:, 0].tolist(),
-        "flagged_frames": _flagged(tracking).nonzero()[:, 0].tolist(),
-        "covered_frames": _covered(tracking),
-        "landmarks_only_frames": _landmarks_only(tracking).nonzero()[:, 0].tolist(),
+        "flagged_frames": flagged.nonzero()[:, 0].tolist(),
+        "covered_frames": covered,
+        "landmarks_only_frames": alone.nonzero()[:, 0].tolist(),
         "residual_px": _summary(front_residuals(tracking)),
-        "residual_colors": None if tracking.pixel_residuals is None else _summary(tracking.pixel_residuals),
+        "residual_colors": None if colors is None else _summary(colors),
         "cameras": _of_cameras(capture, tracking, face_model),
         "shared_misfit": shared_misfit(capture, tracking),
         "frontal_camera": capture.camera_ids[frontal],
@@ -105,29 +112,6 @@ def _of_cameras(capture: Capture, tracking: Tracking, face_model: FaceModel) -> 
 def timestep_residuals(tracking: Tracking) -> Float[Tensor, " t"]:
     """Median residual over the cameras that found the face from the front, in pixels; NaN if none found it."""
     return front_residuals(tracking).nanmedian(1).values
-
-
-def _flagged(tracking: Tracking) -> Bool[Tensor, " t"]:
-    """Frames with landmark or colour residuals that stand out."""
-    flagged = flagged_frames(timestep_residuals(tracking))
-    if tracking.pixel_residuals is not None:
-        flagged |= flagged_frames(tracking.pixel_residuals.nanmedian(1).values, _MIN_COLOR_STEP)
-    return flagged
-
-
-def _covered(tracking: Tracking) -> dict[str, list[int]]:
-    """The frames in which something covers a part of the face, by part; only parts that are covered in any."""
-    if tracking.covered is None:
-        return {}
-    frames = {name: tracking.covered[:, :, part].any(1).nonzero()[:, 0].tolist() for part, name in enumerate(PARTS)}
-    return {name: found for name, found in frames.items() if found}
-
-
-def _landmarks_only(tracking: Tracking) -> Bool[Tensor, " t"]:
-    """Frames with a face that were tracked from landmarks alone."""
-    if tracking.pixel_residuals is None:
-        return tracking.valid
-    return tracking.valid & tracking.pixel_residuals.isnan().all(1)
 
 
 def iris_distances(

@@ -36,10 +36,7 @@ def seen_from_front(tracking: Tracking) -> Bool[Tensor, "t c"]:
 
 
 def front_residuals(tracking: Tracking) -> Float[Tensor, "t c"]:
-    """Residuals of landmarks, with NaN in pictures from the side.
-
-    A timestep without a picture from the front keeps its own.
-    """
+    """Residuals of landmarks. They are NaN in pictures from the side, unless a timestep has no other."""
     front = seen_from_front(tracking) & tracking.residuals.isfinite()
     return tracking.residuals.where(front | ~front.any(1, keepdim=True), torch.nan)
 
