@@ -141,10 +141,10 @@ class Render(_Look):
             raise UserError(f"--path {self.path}: give one of {', '.join(_PATHS)}, or a .json of cameras")
         check_avatar(self.workspace, self.run_name)
         if self.workspace.is_file():
-            of_runs = {"--motion": self.motion, "--timestep": self.timestep, "--device": self.device != "cpu"}
-            of_runs[f"--path {self.path}"] = self._is_listed() or self.path == "captured"
-            for option, given in of_runs.items():
-                if given not in (None, False):
+            of_runs = {"--motion": self.motion is not None, "--timestep": self.timestep is not None}
+            of_runs |= {f"--path {self.path}": self._is_listed() or self.path == "captured"}
+            for option, given in (of_runs | {"--device": self.device != "cpu"}).items():
+                if given:
                     raise UserError(f"{option}: is for runs, and {self.workspace} is a file; leave it out")
         elif self._sequence is not None or self.path == "captured":
             open_workspace(self.workspace).pick_sequence(self._sequence)
