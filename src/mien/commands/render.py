@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import mien.avatar
     import mien.camera
     import mien.face
+    import mien.runtime
 
 _PATHS = ("turntable", "orbit", "sway", "still", "captured")
 _TILT = math.radians(15)
@@ -242,7 +243,9 @@ class Render(_Look):
         from mien.runtime import camera_paths
 
         frames = self._frames(None)
-        view = View(self.yaw, self.pitch, self.zoom, lambda *from_: self._moved(camera_paths, *from_, frames))
+        view = View(
+            self.yaw, self.pitch, self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames)
+        )
         render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
 
     def _moved(self, paths: Any, camera: Any, center: "numpy.ndarray | torch.Tensor", frames: int) -> list[Any]:
