@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import mien.avatar
     import mien.camera
     import mien.face
-    import mien.runtime
 
 _PATHS = ("turntable", "orbit", "sway", "still", "captured")
 _TILT = math.radians(15)
