@@ -249,9 +249,9 @@ def show_rows(
     if not as_json:
         show(format_machine(machine))
     for row in rows:
-        shown += row if isinstance(row, list) else [row]
         if not as_json:
-            show((as_text or format_row)(row))
+            show(as_text(row) if as_text else format_row(row))
+        shown += row if isinstance(row, list) else [row]
     if as_json:
         show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
     return shown

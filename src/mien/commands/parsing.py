@@ -64,17 +64,15 @@ def parse_options(command: type, prog: str, arguments: Sequence[str]) -> Any:
         if names.count(option := f"--{name.replace('_', '-')}") > 1:
             # The first of its values would be dropped without a word.
             raise UserError(f"{option} is given twice; give it once, followed by all of its values")
+    if {"-h", "--help", "--help-all"} & {*arguments}:
+        _help(command, prog, arguments)
     told, more = io.StringIO(), getattr(command, "takes_more", False)
     try:
         with contextlib.redirect_stderr(told):
-            if {"-h", "--help", "--help-all"} & {*arguments}:
-                _help(command, prog, arguments)
             found = tyro.cli(
                 command, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more
             )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
+    except SystemExit:
         remedy = getattr(command, "remedy", "")
         raise UserError(f"{in_one_line(told.getvalue())}; {remedy}see {prog} --help-all") from None
     return replace(found[0], for_all=tuple(found[1])) if more else found

@@ -141,10 +141,10 @@ class Render(_Look):
             raise UserError(f"--path {self.path}: give one of {', '.join(_PATHS)}, or a .json of cameras")
         check_avatar(self.workspace, self.run_name)
         if self.workspace.is_file():
-            of_runs = {"--motion": self.motion, "--timestep": self.timestep, "--device": self.device != "cpu"}
-            of_runs[f"--path {self.path}"] = self._is_listed() or self.path == "captured"
-            for option, given in of_runs.items():
-                if given not in (None, False):
+            of_runs = {"--motion": self.motion is not None, "--timestep": self.timestep is not None}
+            of_runs |= {f"--path {self.path}": self._is_listed() or self.path == "captured"}
+            for option, given in (of_runs | {"--device": self.device != "cpu"}).items():
+                if given:
                     raise UserError(f"{option}: is for runs, and {self.workspace} is a file; leave it out")
         elif self._sequence is not None or self.path == "captured":
             open_workspace(self.workspace).pick_sequence(self._sequence)
@@ -160,7 +160,7 @@ class Render(_Look):
         from mien.avatar.files import load_avatar
         from mien.machine.progress import say, track_progress
         from mien.media.writing import write_pictures
-        from mien.pipeline.draw import draw, posed_softly, tell_of_sides, warn_of_white
+        from mien.pipeline.draw import draw, posed_softly, sides_filmed, warn_of_white
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
@@ -171,6 +171,7 @@ class Render(_Look):
         cameras = self._cameras(workspace, run_dir, avatar, face, len(face) if moves else None)
         output = self.picture.plan(self.out, len(cameras))
         warn_of_white(self.picture, run_dir, avatar)
+        sides = sides_filmed(run_dir, avatar)
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
         face, pose = face.to(like), posed_softly(avatar)
@@ -184,7 +185,8 @@ class Render(_Look):
         write_pictures(output, shown, self.fps)
         count, first = len(avatar.gaussian_store()), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
-        tell_of_sides(run_dir, avatar)
+        if sides is not None:
+            say(sides)
 
     @property
     def _sequence(self) -> str | None:
@@ -240,7 +242,9 @@ class Render(_Look):
         from mien.runtime import camera_paths
 
         frames = self._frames(None)
-        view = View(self.yaw, self.pitch, self.zoom, lambda *from_: self._moved(camera_paths, *from_, frames))
+        view = View(
+            self.yaw, self.pitch, self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames)
+        )
         render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
 
     def _moved(self, paths: Any, camera: Any, center: "numpy.ndarray | torch.Tensor", frames: int) -> list[Any]:
@@ -298,7 +302,7 @@ class Sheet(_Look):
         from mien.machine.progress import say
         from mien.media.writing import write_pictures
         from mien.pipeline import sheets
-        from mien.pipeline.draw import draw, posed_softly, tell_of_sides
+        from mien.pipeline.draw import draw, posed_softly, sides_filmed
         from mien.training.run import filmed_range
 
         workspace = open_workspace(self.workspace)
@@ -314,6 +318,7 @@ class Sheet(_Look):
             tiles = sheets.filmed_tiles(model, face, camera, filmed_range(run_dir, avatar), self.strength)
         else:
             tiles = sheets.expression_tiles(model, face, camera, self.strength)
+        sides = sides_filmed(run_dir, avatar) if self.kind == "turntable" else None
         like = like_on(choose_device(self.device))
         move_avatar(avatar, like)
         pose = posed_softly(avatar)
@@ -327,8 +332,8 @@ class Sheet(_Look):
         output = self.picture.plan(self._output, 1)
         write_pictures(output, [sheets.draw_sheet(tiles, picture, (red, green, blue))], 25.0)
         say(f"{self._output}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
-        if self.kind == "turntable":
-            tell_of_sides(run_dir, avatar)
+        if sides is not None:
+            say(sides)
 
     @property
     def _output(self) -> Path:

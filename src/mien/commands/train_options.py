@@ -50,13 +50,13 @@ class Details(TrainSettings):
     """Settings of a training run. Losses, rates and density control are settings of the method."""
 
     # These have options without a prefix.
-    steps: _Elsewhere
-    split: _Elsewhere
-    background: _Elsewhere
-    seed: _Elsewhere
-    device: _Elsewhere
-    held_out_sequences: _Elsewhere
-    held_out_cameras: _Elsewhere
+    steps: _Elsewhere = None
+    split: _Elsewhere = None
+    background: _Elsewhere = None
+    seed: _Elsewhere = None
+    device: _Elsewhere = None
+    held_out_sequences: _Elsewhere = None
+    held_out_cameras: _Elsewhere = None
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,8 @@ def read_config_file(path: Path) -> ConfigFile:
     if method is not None and (not isinstance(method, str) or not has_method(method)):
         raise UserError(f"{path}: method.kind {shown(method)}: give the name of a method: {', '.join(method_names())}")
     changes = {name: value for name, value in parts["method"].items() if name != "kind"}
-    data = content.get("data") if isinstance(content.get("data"), list) else []
+    data: Any = content.get("data")
+    data = data if isinstance(data, list) else []
     sequences = (shown(entry["sequence"]) for entry in data if isinstance(entry, dict) and "sequence" in entry)
     return ConfigFile(path, method, changes, parts["settings"], tuple(sequences))
 

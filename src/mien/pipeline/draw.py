@@ -85,12 +85,10 @@ def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> Non
         )
 
 
-def tell_of_sides(run_dir: Path, avatar: Avatar) -> None:
-    """Say how far to each side the head was filmed, if that is known. Beyond, it is completed."""
-    covered = read_coverage(run_dir, avatar.face_model)
-    if covered is not None:
-        neutral = avatar.face_model.head_vertices(avatar.subject)[0].detach()
-        say(filmed_words(avatar.face_model.to(neutral), neutral, covered))
+def sides_filmed(run_dir: Path, avatar: Avatar) -> str | None:
+    """How far to each side the head was filmed, in words, if that is known. Beyond, it is completed."""
+    covered, model = read_coverage(run_dir, avatar.face_model), avatar.face_model
+    return None if covered is None else filmed_words(model, model.head_vertices(avatar.subject)[0].detach(), covered)
 
 
 def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
