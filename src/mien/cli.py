@@ -159,7 +159,7 @@ def _run(name: str, rest: list[str]) -> int:
 
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
     module = importlib.import_module("mien.commands." + name.replace("-", "_"))
-    kind = module.command_for(rest) if hasattr(module, "command_for") else module.Command
+    kind = module.task_of(rest) if hasattr(module, "task_of") else module.Command
     rest, for_all = _for_all_rows(name, rest)
     for option in list_options(kind):
         if sum(argument.partition("=")[0].replace("_", "-") == option for argument in rest) > 1:

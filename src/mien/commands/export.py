@@ -95,7 +95,7 @@ class Command:
             raise UserError(f"{self.out}: is the file that is read; choose another name")
 
 
-def command_for(arguments: Sequence[str]) -> type[Command]:
+def task_of(arguments: Sequence[str]) -> type[Command]:
     """The command with the options of the format that the arguments ask for."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--out", nargs="?")

@@ -121,7 +121,7 @@ class Submission:
         export_submission(workspace, workspace.pick_run(self.run_name), self.benchmark, self.out)
 
 
-def command_for(arguments: Sequence[str]) -> type:
+def task_of(arguments: Sequence[str]) -> type:
     """The command with the options that its --format has."""
     scored = bool({SUBMISSION, f"--format={SUBMISSION}"} & {*arguments})
     kind, other = (Submission, Command) if scored else (Command, Submission)
