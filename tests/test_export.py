@@ -123,7 +123,6 @@ def test_options_that_do_not_fit_the_output_are_refused(tmp_path: Path, capsys: 
         ("a.ply", "--largest is an option of html or packed, not of ply", "--largest", "1"),
         ("a.html", "--largest 0: give a number of MB above 0", "--largest", "0"),
         ("a.html", "--largest nan: give a number of MB above 0", "--largest", "nan"),
-        ("a.packed", "--webcam is an option of html, not of packed", "--webcam"),
         ("a.ply", "--sharp-cut is an option of mien, html or packed", "--sharp-cut"),
         ("a.glb", "a file does not have all that this format needs; export its workspace"),
         ("me.mien", "is the file that is read"),
@@ -266,7 +265,6 @@ def test_every_ply_of_floats_is_read(tmp_path: Path, newline: str, types: dict[s
 
 @pytest.mark.parametrize(("types", "extra", "words"), [
     ({"x": "uint8"}, "", "has 'property uchar x', not float"),
-    ({"f_rest_3": "int16"}, "", "has 'property short f_rest_3', not float"),
     ({}, "property list uchar int vertex_indices\n", "has 'property list uchar int vertex_indices', not float"),
     ({}, "property uint packed_position\n", "is a compressed .ply, .* save it uncompressed, or as .sog"),
 ])  # fmt: skip

@@ -285,7 +285,6 @@ def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch
     assert f"{out}: 10 training frames, 2 held out; see README.txt" in capsys.readouterr().err
     (sequence,) = read(out, "insta", scene.model)
     assert sequence.own_split.timesteps == ((10, 12),)
-    capsys.readouterr()
     refused("out: is not empty, and a capture is written into a new folder", "--format", "insta")
     (workspace / "sequences/clip/tracking/tracking.json").unlink()
     refused("the sequence clip is not tracked", "--format", "nerface")

@@ -152,8 +152,7 @@ def edit(folder: Path, kind: str = "int", **values: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "value"),
-    [("float", np.nan), ("float", 2.5), ("int", -1), ("uint", 2**31 - 1), ("gone", 0)],
+    ("kind", "value"), [("float", np.nan), ("float", 2.5), ("int", -1), ("uint", 1e9), ("gone", 0)]
 )
 def test_a_damaged_binding_is_named(kind: str, value: float, folder: Path) -> None:
     path = folder / "point_cloud.ply"

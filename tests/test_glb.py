@@ -220,7 +220,6 @@ def test_the_mesh_alone_is_small_and_the_same(glb: Glb, portable: runtime.Portab
     for name in alone.content["meshes"][0]["primitives"][0]["attributes"]:
         np.testing.assert_array_equal(attribute(alone, name), attribute(glb, name))
     assert alone.content["skins"] == glb.content["skins"]
-    assert len(alone.content["meshes"]) == 1
     refuses("has no avatar of mien", read_glb_avatar, path)
     package("gltf-validator", NO_VALIDATOR)
     assert run_node("validate.mjs", path)["issues"]["messages"] == []
