@@ -272,7 +272,7 @@ def test_damaged_coverage_is_named(toy: Toy, tmp_path: Path) -> None:
     found = covered(toy)
     write_coverage(tmp_path, found)
     assert torch.equal(known(read_coverage(tmp_path, toy[0])).colors, found.colors)
-    write_coverage(tmp_path, replace(found, seen=found.seen + 1))
+    write_coverage(tmp_path, replace(found, seen=found.seen[1:]))
     refuses(FILE, read_coverage, tmp_path, toy[0])
 
 

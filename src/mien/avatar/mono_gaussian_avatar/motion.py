@@ -7,7 +7,7 @@ model's joints there is one more bone, which stands still in the world while the
 from abc import ABC
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from mien.arrays import is_native
 from mien.avatar.avatar import Avatar
 from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
-from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, FreePointsConfig
 from mien.avatar.ops.points import at_places, random_places, sample_surface
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.settings import Progress
@@ -60,8 +60,7 @@ class BakedMotion(NamedTuple):
 class FreePoints(Avatar, ABC):
     """Points that a network moves with the face, from the canonical one to others."""
 
-    config: Any
-    """`MonoGaussianAvatarConfig`, or `PointAvatarConfig`, which has the same names for what is used here."""
+    config: FreePointsConfig
     deformation: DeformationNet
     canonical_expression: Tensor
     canonical_joints: Tensor
