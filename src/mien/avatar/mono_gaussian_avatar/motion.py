@@ -18,10 +18,10 @@ from mien.arrays import is_native
 from mien.avatar.avatar import Avatar
 from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
-from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, FreePointsConfig
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.points import at_places, random_places, sample_surface
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
-from mien.avatar.settings import Progress
+from mien.avatar.settings import FreePointsConfig, Progress
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform

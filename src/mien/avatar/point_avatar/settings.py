@@ -3,8 +3,15 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from mien.avatar.mono_gaussian_avatar.settings import PAPER_FEATURES, FreePointsConfig, free_points_paper
-from mien.avatar.settings import GAUSSIAN_COUNT, Differences, Photometric, Rate
+from mien.avatar.settings import (
+    FREE_POINTS_PAPER_FEATURES,
+    GAUSSIAN_COUNT,
+    Differences,
+    FreePointsConfig,
+    Photometric,
+    Rate,
+    free_points_paper,
+)
 from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)
@@ -56,7 +63,7 @@ _PAPER_EPOCHS, _PAPER_FRAMES = 60, 2_500
 """The preset `paper` is a video of 100 seconds, over as many epochs as the number of points needs and 20 more."""
 _PAPER = {
     **free_points_paper(_PAPER_EPOCHS),
-    "photometric": {"ssim_weight": 0.0, "perceptual": PAPER_FEATURES},
+    "photometric": {"ssim_weight": 0.0, "perceptual": FREE_POINTS_PAPER_FEATURES},
     "frames_per_step": 1,
     "normals": "deformed",
     "surface_width": 256,

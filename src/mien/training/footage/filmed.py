@@ -47,10 +47,9 @@ def read_coverage(run_dir: Path, face_model: FaceModel) -> Coverage | None:
         return None
     tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, _REMEDY):
-        coverage = Coverage(**tensors)
-        if len(coverage.seen) != len(face_model.faces):
+        if len(tensors["seen"]) != len(face_model.faces):
             raise ValueError("it has another number of triangles")
-        return coverage
+        return Coverage(**tensors)
 
 
 def filmed_share(vertices: Float[Tensor, "v 3"], face_model: FaceModel, coverage: Coverage, camera: Camera) -> float:
