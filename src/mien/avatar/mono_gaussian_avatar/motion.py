@@ -7,7 +7,7 @@ model's joints there is one more bone, which stands still in the world while the
 from abc import ABC
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.ops.points import at_places, random_places, sample_surface
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
-from mien.avatar.settings import FreePointsConfig, Progress
+from mien.avatar.settings import Progress
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle, rigid_transform
@@ -60,7 +60,8 @@ class BakedMotion(NamedTuple):
 class FreePoints(Avatar, ABC):
     """Points that a network moves with the face, from the canonical one to others."""
 
-    config: FreePointsConfig
+    config: Any
+    """A `FreePointsConfig`."""
     deformation: DeformationNet
     canonical_expression: Tensor
     canonical_joints: Tensor

@@ -83,9 +83,9 @@ class WholeHead:
 
         `meanwhile` lets another thread call a function, and returns what waits for its result.
         """
-        interior = self._interior
-        for one in batch if interior is not None else ():
-            fill_interior(self._surface, self._avatar.face_model, interior, one.number, self._settings.steps)
+        if self._interior is not None:
+            for one in batch:
+                fill_interior(self._surface, self._avatar.face_model, self._interior, one.number, self._settings.steps)
         side_views, self._next_view = self.side_views, None
         due = [] if side_views is None else [one for one in batch if side_views.due(one.number)]
         if side_views is not None and due:
