@@ -1,6 +1,6 @@
 """Train captures with one constant or one setting changed at a time, and print what each change is worth.
 
-    python benchmarks/ablate.py out/wojtek out/d3 --set avatar.gaussian_avatars.surface.FILL_OPACITY=0.9 --steps 1000
+    python benchmarks/ablate.py out/wojtek out/d3 --set avatar.bound_surface.FILL_OPACITY=0.9 --steps 1000
 
 Give the captures first: workspaces with tracked sequences. Each is trained once as it is and once with each change, as
 `mien train` does, and its held-out frames are scored as `mien evaluate` does. `--list` prints what --set can change;

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 import train_toy
-from mien import _native
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.methods import METHODS
@@ -25,7 +24,7 @@ from mien.camera import Camera
 from mien.commands.parsing import field_docs
 from mien.disk.config import FRACTION, NotBelow, Range, check_ranges
 from mien.errors import UserError
-from mien.training import PRESETS, TrainSettings, train, trainer
+from mien.training import PRESETS, TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import round_steps
 from mien.training.footage.frames import LEAST_EXTENT, Frame, camera_extent
@@ -325,15 +324,6 @@ def test_training_refuses_settings_out_of_range_and_tells_of_those_that_make_it_
     with pytest.raises(UserError, match=r"training diverged by step \d+ \(.*\); lower the learning rates"):
         train([sequence], face_model, config, train_toy.SETTINGS, tmp_path / "run")
     assert not (tmp_path / "run" / "avatar").exists()
-
-
-def test_threads_of_a_run_are_those_it_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, seen = _native.thread_count(), []
-    face_model, sequence = toy_sequence(timesteps=5, size=32)
-    settings, first = replace(train_toy.SETTINGS, steps=1, threads=before + 1), trainer.step
-    monkeypatch.setattr(trainer, "step", lambda *given: seen.append(_native.thread_count()) or first(*given))
-    train([sequence], face_model, train_toy.CONFIG, settings, tmp_path)
-    assert (seen, _native.thread_count()) == ([before + 1], before)
 
 
 def about_options(help_text: str) -> dict[str, str]:

@@ -93,14 +93,14 @@ def test_a_preset_that_the_method_does_not_have_is_refused(workspace, capsys, mo
 def test_options_reach_every_depth_and_win_over_the_file_and_the_file_over_the_preset(choices: Any) -> None:
     line = """--method.sh-degree 2 --method.sh-frame head --method.density.max-gaussians=20000 --training.resolution 256
         --method.means-rate.start 4e-3 --method.means-rate.end 4e-5 --method.photometric.alpha_weight 0.1 --steps 70
-        --method.density.opacity-resets 0.2 0.5 --training.threads 1 --method.face-tuning.head-translation.begin 0.5"""
+        --method.density.opacity-resets 0.2 0.5 --training.record-every 7 --method.face-tuning.begin 0.5"""
     config = replace(
         STANDARD, sh_degree=2, sh_frame="head", means_rate=Rate(4e-3, 4e-5),
         photometric=replace(STANDARD.photometric, alpha_weight=0.1),
         density=GradientSettings(grow_gradient=1e-4, max_gaussians=20_000, opacity_resets=(0.2, 0.5)),
         face_tuning=FaceTuning(head_translation=4e-4, begin=0.5, keep_mean_pose=True, keep_turns=True),
     )  # fmt: skip
-    assert choices(line) == (config, replace(RUN, steps=70, resolution=256, threads=1))
+    assert choices(line) == (config, replace(RUN, steps=70, resolution=256, record_every=7))
     config, _ = choices("--method headgas --method.features 8 --method.density.rounds 3")
     assert config == HeadGasConfig(features=8, density=replace(HeadGasConfig().density, rounds=3))
     file = {

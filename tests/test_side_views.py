@@ -144,7 +144,7 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
 
 def test_the_outline_has_the_hair_and_ends_at_the_cut_at_the_neck(anny):
     view, hairy = (_view(_views(anny, hair=hair), _face(anny), 0) for hair in (0.0, _HAIR))
-    face, camera, alpha = view.plan.face, view.plan.camera, view.alpha
+    face, camera, alpha = view.face, view.camera, view.alpha
     assert float(hairy.alpha.sum()) > 1.05 * float(alpha.sum())
     vertices = anny(face)[0]
     head = rasterize_mesh(vertices, anny.faces[~anny.region_mask("neck")], camera).face_index >= 0
@@ -154,7 +154,7 @@ def test_the_outline_has_the_hair_and_ends_at_the_cut_at_the_neck(anny):
     assert alpha.equal(torch.from_numpy(expected).float() / 255)
     assert float(alpha.sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
     shown = view.picture[alpha == 0]
-    torch.testing.assert_close(shown, view.plan.background.expand(len(shown), 3))
+    torch.testing.assert_close(shown, view.background.expand(len(shown), 3))
 
 
 def test_sides_are_filled_by_themselves_if_one_camera_filmed():

@@ -100,16 +100,6 @@ def test_a_stop_leaves_a_checkpoint_of_its_step(number, kind, tmp_path, undistur
     assert_same_results(tmp_path, undisturbed)
 
 
-@pytest.mark.parametrize("last", [3, 8])
-def test_a_checkpoint_that_has_lost_its_curves_is_refused(last: int, tmp_path: Path) -> None:
-    """Curves are empty only before the first record, which is at step 3."""
-    pytest.raises(KeyboardInterrupt, train_until_step, tmp_path, last, interrupt)
-    path = checkpoint_files(tmp_path / "checkpoints")[-1]
-    tensors = {name: tensor for name, tensor in read_tensors(path).items() if not name.startswith("curves.")}
-    write_tensors(path, tensors, {"format": "mien.checkpoint", "version": "1"})
-    refuses("its curves are incomplete", train_toy.main, tmp_path, STEPS)
-
-
 def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     """What a run sums up over its steps counts the processes before a stop: time, peak memory, records, steps."""
     for last in (2, 4):  # the second process takes four steps, up to step 6

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypedDict, final
 
-from mien.disk.config import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, check_ranges
+from mien.disk.config import COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, NotBelow, Range, ToLoad, check_ranges
 
 
 @dataclass(frozen=True)
@@ -262,3 +262,65 @@ class MethodConfig:
     def check(self) -> None:
         """Check that all numbers are in their ranges."""
         check_ranges(self, lambda name: f"--method.{name.replace('_', '-')}")
+
+
+@dataclass(frozen=True)
+class FreePointsConfig(MethodConfig):
+    """Settings of free points that networks move, which several methods share."""
+
+    face_tuning: FaceTuning = FaceTuning(
+        expression=4e-4, joints=4e-4, head_rotation=4e-4, head_translation=1.2e-4, begin=0.1
+    )
+    """Whether and how fast the tracked face parameters change. In the paper, this begins with epoch 10."""
+    frames_per_step: Annotated[int, Range(1, 64)] = 2
+    """Largest number of frames of an optimiser step. They share what depends on the points alone."""
+    start: Literal["sphere", "face"] = "face"
+    """Points start on a sphere around the head, or on the surface of the face model."""
+    pretraining: Annotated[int, Range(0, 1_000_000)] = 1_000
+    """Number of steps before the first picture, in which a network learns how the face model moves."""
+    points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 10_000
+    """Number of points at the start."""
+    sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
+    """Radius of the initial sphere around the origin of the head frame, in metres."""
+    max_points: Annotated[int, GAUSSIAN_COUNT] = 30_000
+    """Largest number of points. Growth stops there."""
+    deformation_width: Annotated[int, Range(1, 1024)] = 64
+    """Width of the deformation network."""
+    means_rate: Rate = Rate(1e-4, 1e-5)
+    """Learning rate of the points, in metres per step."""
+    network_rate: Rate = Rate(5e-4, 5e-5)
+    """Learning rate of the networks, per step. The papers' are smaller, over some hundred thousand steps."""
+    face_skinning_weight: Annotated[float, NOT_NEGATIVE] = 1.0
+    """Weight of the mean squared distance of a point's skinning weights from those of the nearest vertex. A method
+    may let this weight and the two below fall in the course of the run."""
+    face_expression_weight: Annotated[float, NOT_NEGATIVE] = 1e4
+    """Weight of the same distance of expression directions, in units where the coefficients' mean variance is 1."""
+    face_correctives_weight: Annotated[float, NOT_NEGATIVE] = 1e4
+    """Weight of the same distance of pose correctives."""
+    face_points: Annotated[int, GAUSSIAN_COUNT] = 256
+    """Number of points that these losses, and the method's others of points, use in each step, in turn."""
+
+
+FREE_POINTS_PAPER_FEATURES = {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3}
+"""The perceptual loss of the papers of these methods."""
+
+
+def free_points_paper(epochs: int) -> dict[str, Any]:
+    """What the presets `paper` of these methods share, over a number of epochs."""
+    return {
+        "face_tuning": {
+            "expression": 5e-4,
+            "joints": 5e-4,
+            "head_rotation": 5e-4,
+            "head_translation": 0.0,
+            "begin": 10 / epochs,
+        },
+        "start": "sphere",
+        "pretraining": 0,
+        "points": 400,
+        "max_points": 100_000,
+        "epochs": epochs,
+        "deformation_width": 128,
+        "network_rate": {"start": 1e-4, "end": None},
+        "face_points": 100_000,
+    }

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -36,9 +36,6 @@ class FactoredUpdate(NamedTuple):
     moments: Moments | FactoredMoments
     """Of Adam as published, with two running means of every number, or one second moment for all k."""
     rate: float
-
-
-_State = TypeVar("_State", Moments, FactoredMoments)
 
 
 class Adam:
@@ -83,7 +80,7 @@ class Adam:
             group, name = key.split("/", 1)
             self._moments.setdefault(group, {})[name] = moments
 
-    def _state(self, group: ParameterGroup, name: str, tensor: Tensor, kind: type[_State]) -> _State:
+    def _state(self, group: ParameterGroup, name: str, tensor: Tensor, kind: type[Any]) -> Any:
         own = self._moments.setdefault(group.name, {}) if group.moments is None else group.moments
         if name not in own:
             own[name] = kind.zeros(tensor.detach())
@@ -147,7 +144,7 @@ def factored_update(update: FactoredUpdate) -> None:
     if _fit_core((*arrays, *(tensor for term in terms for tensor in term))):
         native_values, *native_state = unpacked(*arrays)
         rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
-        apply = _native.factored_update if factored else _native.factored_adam_update
+        apply: Any = _native.factored_update if factored else _native.factored_adam_update
         apply(native_values, rows, columns, *native_state, rate)
     elif factored:
         factored_update_reference(update)

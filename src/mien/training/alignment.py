@@ -20,6 +20,7 @@ from mien.avatar.avatar import Avatar, ParameterGroup, frozen, move_avatar
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.avatar.settings import FaceTuning
 from mien.avatar.store import Moments
+from mien.camera import Camera
 from mien.disk.config import overlay
 from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
@@ -63,9 +64,8 @@ class _View:
     """One picture, and which timestep of its batch it belongs to."""
 
     place: int
-    targets: Targets
-    timestep: int
-    camera: int
+    camera: Camera
+    target: Target
     gain: Float[Tensor, " 3"] | None
     """The light of its timestep. None if it is steady."""
 
@@ -234,19 +234,17 @@ class _Batch:
     indices: list[int]
     """Indices of the timesteps in the track."""
     views: list[_View]
-    shown: list[Target]
-    """The picture of each view."""
 
     @staticmethod
     def of(timesteps: list[_Timestep], track: FaceTrack, targets: Items[Targets], gains: Items[Tensor]) -> "_Batch":
         """The batch of some timesteps."""
-        views = [
-            _View(place, targets[sequence], timestep, camera, gains[sequence][timestep] if gains else None)
-            for place, (sequence, timestep, cameras) in enumerate(timesteps)
-            for camera in cameras
-        ]
-        shown = [view.targets.target(view.timestep, view.camera, _WHITE, keep=False) for view in views]
-        return _Batch([track.index_of(sequence, timestep) for sequence, timestep, _ in timesteps], views, shown)
+        views = []
+        for place, (sequence, timestep, cameras) in enumerate(timesteps):
+            own, gain = targets[sequence], gains[sequence][timestep] if gains else None
+            for camera in cameras:
+                target = own.target(timestep, camera, _WHITE, keep=False)
+                views.append(_View(place, own.camera(camera), target, gain))
+        return _Batch([track.index_of(sequence, timestep) for sequence, timestep, _ in timesteps], views)
 
     def groups(self, track: FaceTrack) -> list[ParameterGroup]:
         """The parameters of all timesteps."""
@@ -256,17 +254,13 @@ class _Batch:
         """Draw all views, and leave the gradient of what differs from their pictures at the parameters."""
         posed = avatar.pose(concatenate([track.face(index) for index in self.indices])).gaussians.timesteps()
         pictures = rasterize_each(
-            [(posed[view.place], view.targets.camera(view.camera)) for view in self.views],
-            [target.background for target in self.shown],
+            [(posed[view.place], view.camera) for view in self.views], [view.target.background for view in self.views]
         )
-        pictures = [
-            picture if view.gain is None else lit(picture, target.background, view.gain)
-            for picture, view, target in zip(pictures, self.views, self.shown, strict=True)
-        ]
-        losses = [
-            photometric_loss(picture.image, target.picture, box=target.box, drawn=picture.alpha)
-            for picture, target in zip(pictures, self.shown, strict=True)
-        ]
+        losses = []
+        for picture, view in zip(pictures, self.views, strict=True):
+            target = view.target
+            seen = picture if view.gain is None else lit(picture, target.background, view.gain)
+            losses.append(photometric_loss(seen.image, target.picture, box=target.box, drawn=seen.alpha))
         torch.autograd.backward(losses)
 
 

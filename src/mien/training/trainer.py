@@ -247,7 +247,7 @@ def start(
     if surface is not None and surface.wants_first_colors:
         surface.set_first_colors(vertex_colors(footage))
     like = torch.zeros(()) if like is None else like
-    gains, colors = (make(sequences, frames, settings, like) for make in (frame_gains, camera_colors))
+    gains, colors = frame_gains(sequences, frames, settings, like), camera_colors(sequences, frames, settings, like)
     make_head = prepare_whole_head(avatar, footage, settings)
     away = turns_from_mean(face, shown)
     move_avatar(avatar, like)

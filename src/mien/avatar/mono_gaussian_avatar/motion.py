@@ -61,7 +61,7 @@ class FreePoints(Avatar, ABC):
     """Points that a network moves with the face, from the canonical one to others."""
 
     config: Any
-    """`MonoGaussianAvatarConfig`, or `PointAvatarConfig`, which has the same names for what is used here."""
+    """A `FreePointsConfig`."""
     deformation: DeformationNet
     canonical_expression: Tensor
     canonical_joints: Tensor

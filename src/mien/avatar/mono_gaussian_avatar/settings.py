@@ -1,19 +1,26 @@
 """The settings of MonoGaussianAvatar."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from mien.avatar.settings import EPSILON_RANGE, GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric, Rate
-from mien.disk.config import NOT_NEGATIVE, Above, Range, ToLoad
+from mien.avatar.settings import (
+    EPSILON_RANGE,
+    FREE_POINTS_PAPER_FEATURES,
+    Differences,
+    FreePointsConfig,
+    Photometric,
+    Rate,
+    free_points_paper,
+)
+from mien.disk.config import Above, Range
 
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 _WIDTH = Range(1, 1024)
-_FACE_RATE = 4e-4
 
 
 @dataclass(frozen=True)
-class MonoGaussianAvatarConfig(MethodConfig):
+class MonoGaussianAvatarConfig(FreePointsConfig):
     """Settings of MonoGaussianAvatar. The defaults suit a CPU and runs of some thousand steps.
 
     They add to the paper: points start on the face (`start`), networks learn the motion of the face model before the
@@ -22,24 +29,8 @@ class MonoGaussianAvatarConfig(MethodConfig):
 
     photometric: Photometric = Photometric(l1_weight=1.0, ssim_weight=0.25)
     """Losses of pictures. The weights of L1 and 1 - SSIM are the paper's."""
-    face_tuning: FaceTuning = FaceTuning(
-        expression=_FACE_RATE, joints=_FACE_RATE, head_rotation=_FACE_RATE, head_translation=1.2e-4, begin=0.1
-    )
-    """Whether and how fast the tracked face parameters change. In the paper, this begins with epoch 10."""
-    frames_per_step: Annotated[int, Range(1, 64)] = 2
-    """Largest number of frames of an optimiser step. They share what depends on the points alone."""
     points_per_step: Annotated[int, Range(1, 100_000_000)] = 102_400
     """Largest number of points, summed over the frames of an optimiser step."""
-    start: Literal["sphere", "face"] = "face"
-    """Points start on a sphere around the head, or on the surface of the face model."""
-    pretraining: Annotated[int, Range(0, 1_000_000)] = 1_000
-    """Number of steps before the first picture, in which a network learns how the face model moves."""
-    points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 10_000
-    """Number of Gaussians at the start."""
-    sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
-    """Radius of the initial sphere around the origin of the head frame, in metres."""
-    max_points: Annotated[int, GAUSSIAN_COUNT] = 30_000
-    """Largest number of Gaussians. Growth stops there."""
     epochs: Annotated[int, Range(1, 100_000), Above("first_epoch")] = 115
     """The paper's epoch with which the run ends. After each epoch, points are pruned and refilled; number of points,
     radii and the weight of the face model's terms follow the epochs."""
@@ -58,74 +49,45 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Number of octaves of its encoding of positions. The shortest wave is 6 mm; with 6 octaves, 49 mm."""
     sphere_start: bool = False
     """Whether its trunk starts as about the signed distance to a sphere, as in the paper."""
-    deformation_width: Annotated[int, _WIDTH] = 64
-    """Width of the deformation network."""
     skinning_norm: bool = False
     """Whether the hidden layer of the skinning weights has weight normalisation, as published."""
     change_width: Annotated[int, _WIDTH] = 32
     """Width of the network that changes attributes with motion."""
     scale_gain: Annotated[float, Range(0, 1000)] = 0.00625
     """Largest scale that the networks add to the radius of all points, in metres (paper: 0.0025 at 1024x1024)."""
-    means_rate: Rate = Rate(1e-4, 1e-5)
-    """Learning rate of the points, in metres per step."""
-    network_rate: Rate = Rate(5e-4, 5e-5)
-    """Learning rate of the networks, per step. The paper's is smaller, over some hundred thousand steps."""
     own_rate: Rate = Rate(5e-2, 2e-3)
     """Learning rate of what each point adds to the attributes of its position, per step. With 0, nothing."""
     adam_epsilon: Annotated[float, EPSILON_RANGE] = 1e-15
     """Adam's epsilon for points and networks. Only 1e-15 is in the native code (published code: 1e-8)."""
     rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
     """Times at which their rates are halved, as fractions of the run (paper: epochs 80 and 100)."""
-    face_skinning_weight: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Weight of the mean squared distance of a point's skinning weights from those of the nearest vertex. This weight
-    and the two below halve at epochs 20, 30, 50 and 70."""
-    face_expression_weight: Annotated[float, NOT_NEGATIVE] = 1e4
-    """Weight of the same distance of expression directions, in units where the coefficients' mean variance is 1."""
     face_expression_by_variance: bool = True
     """Whether a coefficient's term is also divided by its variance and by the number of coefficients, as in the
     published code; the supplement has neither."""
-    face_correctives_weight: Annotated[float, NOT_NEGATIVE] = 1e4
-    """Weight of the same distance of pose correctives."""
-    face_points: Annotated[int, GAUSSIAN_COUNT] = 256
-    """Number of points that these losses use in each step, in turn."""
 
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500
 """The preset `paper` spans the epochs up to which results are published, over a video of 100 seconds."""
-_PAPER: dict[str, Any] = {
-    "photometric": {"perceptual": {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3}},
-    "face_tuning": {
-        "expression": 5e-4,
-        "joints": 5e-4,
-        "head_rotation": 5e-4,
-        "head_translation": 0.0,
-        "begin": 10 / _PAPER_EPOCHS,
-    },
+_PAPER = {
+    **free_points_paper(_PAPER_EPOCHS),
+    "photometric": {"perceptual": FREE_POINTS_PAPER_FEATURES},
     "frames_per_step": 8,
-    "start": "sphere",
-    "pretraining": 0,
-    "points": 400,
-    "max_points": 100_000,
     "first_epoch": 0,
-    "epochs": _PAPER_EPOCHS,
     "schedule": "paper",
     "late_epoch": 101,
     "attribute_width": 256,
     "attribute_layers": 7,
     "encoding_bands": 6,
     "sphere_start": True,
-    "deformation_width": 128,
     "skinning_norm": True,
     "change_width": 64,
     "means_rate": {"start": 1e-4 * LENGTH_UNIT, "end": None},
-    "network_rate": {"start": 1e-4, "end": None},
     "own_rate": {"start": 0.0, "end": None},
     "adam_epsilon": 1e-8,
     "rate_halvings": [80 / _PAPER_EPOCHS, 100 / _PAPER_EPOCHS],
     "face_expression_weight": 1e3,
     "face_expression_by_variance": False,
     "face_correctives_weight": 1e3,
-    "face_points": 100_000,
 }
 """The paper's settings (docs/paper_preset.md)."""
 _CPU_FRAMES = 30

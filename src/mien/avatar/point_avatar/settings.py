@@ -1,17 +1,24 @@
 """The settings of PointAvatar."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from mien.avatar.settings import GAUSSIAN_COUNT, Differences, FaceTuning, MethodConfig, Photometric, Rate
+from mien.avatar.settings import (
+    FREE_POINTS_PAPER_FEATURES,
+    GAUSSIAN_COUNT,
+    Differences,
+    FreePointsConfig,
+    Photometric,
+    Rate,
+    free_points_paper,
+)
 from mien.disk.config import NOT_NEGATIVE, Range, ToLoad
 
 _WIDTH = Range(1, 1024)
-_FACE_RATE = 4e-4
 
 
 @dataclass(frozen=True)
-class PointAvatarConfig(MethodConfig):
+class PointAvatarConfig(FreePointsConfig):
     """Settings of PointAvatar. The defaults suit a CPU and runs of some thousand steps.
 
     They add to the paper: points start on the face (`start`), networks learn the motion of the face model before the
@@ -20,21 +27,8 @@ class PointAvatarConfig(MethodConfig):
 
     photometric: Photometric = Photometric(l1_weight=1.0, ssim_weight=0.25, alpha_weight=1.0)
     """Losses of pictures. The paper has no SSIM."""
-    face_tuning: FaceTuning = FaceTuning(
-        expression=_FACE_RATE, joints=_FACE_RATE, head_rotation=_FACE_RATE, head_translation=1.2e-4, begin=0.1
-    )
-    frames_per_step: Annotated[int, Range(1, 64)] = 2
-    """Number of frames that one optimiser step uses. They share what depends on the points alone."""
-    start: Literal["sphere", "face"] = "face"
-    """Points start on a sphere around the head, or on the surface of the face model."""
-    pretraining: Annotated[int, Range(0, 1_000_000)] = 1_000
-    """Number of steps before the first picture, in which a network learns how the face model moves."""
     points: Annotated[int, Range(1, 1_000_000), ToLoad(1)] = 5_000
-    """Number of points at the start."""
-    sphere_radius: Annotated[float, Range(1e-3, 10)] = 0.125
-    """Radius of the initial sphere around the origin of the head frame, in metres."""
     max_points: Annotated[int, GAUSSIAN_COUNT] = 40_000
-    """Largest number of points. Growth stops there."""
     epochs: Annotated[int, Range(1, 100_000)] = 40
     """Number of epochs of the run. After each, points that no picture showed are replaced, up to the next number."""
     growth_epochs: Annotated[int, Range(1, 100_000)] = 5
@@ -52,22 +46,11 @@ class PointAvatarConfig(MethodConfig):
     """Number of layers of that network before its outputs."""
     encoding_bands: Annotated[int, Range(0, 24)] = 6
     """Number of octaves of that network's encoding of positions."""
-    deformation_width: Annotated[int, _WIDTH] = 64
-    """Width of the deformation network."""
     shading_width: Annotated[int, _WIDTH] = 32
     """Width of the network that turns normals into light."""
-    means_rate: Rate = Rate(1e-4, 1e-5)
-    """Learning rate of the points, in metres per step."""
     network_rate: Rate = Rate(1e-3, 1e-4)
-    """Learning rate of the networks, per step."""
-    face_skinning_weight: Annotated[float, NOT_NEGATIVE] = 1.0
-    """Weight of the mean squared distance of a point's skinning weights from those of the nearest vertex."""
     face_expression_weight: Annotated[float, NOT_NEGATIVE] = 1e3
-    """Weight of the same distance of expression directions, in units where the coefficients' mean variance is 1."""
     face_correctives_weight: Annotated[float, NOT_NEGATIVE] = 1e3
-    """Weight of the same distance of pose correctives."""
-    face_points: Annotated[int, GAUSSIAN_COUNT] = 256
-    """Number of points that these three losses and the two below use in each step, in turn."""
     distance_weight: Annotated[float, NOT_NEGATIVE] = 1.0
     """Weight of the mean squared distance of points from the surface, in units of 0.25 m."""
     slope_weight: Annotated[float, NOT_NEGATIVE] = 0.1
@@ -78,32 +61,15 @@ class PointAvatarConfig(MethodConfig):
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 60, 2_500
 """The preset `paper` is a video of 100 seconds, over as many epochs as the number of points needs and 20 more."""
-_PAPER: dict[str, Any] = {
-    "photometric": {
-        "ssim_weight": 0.0,
-        "perceptual": {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3},
-    },
-    "face_tuning": {
-        "expression": 5e-4,
-        "joints": 5e-4,
-        "head_rotation": 5e-4,
-        "head_translation": 0.0,
-        "begin": 10 / _PAPER_EPOCHS,
-    },
+_PAPER = {
+    **free_points_paper(_PAPER_EPOCHS),
+    "photometric": {"ssim_weight": 0.0, "perceptual": FREE_POINTS_PAPER_FEATURES},
     "frames_per_step": 1,
-    "start": "sphere",
-    "pretraining": 0,
-    "points": 400,
-    "max_points": 100_000,
-    "epochs": _PAPER_EPOCHS,
     "normals": "deformed",
     "surface_width": 256,
     "surface_layers": 7,
-    "deformation_width": 128,
     "shading_width": 64,
     "means_rate": {"start": 2.5e-5, "end": None},
-    "network_rate": {"start": 1e-4, "end": None},
-    "face_points": 100_000,
 }
 
 PRESETS: dict[str, Differences] = {

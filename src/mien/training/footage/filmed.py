@@ -47,16 +47,9 @@ def read_coverage(run_dir: Path, face_model: FaceModel) -> Coverage | None:
         return None
     tensors = read_tensors(path, "`mien train`")
     with expect_whole(path, _REMEDY):
-        count = len(face_model.faces)
-        for name, shape in zip(_FIELDS, ((count,), (count, 3), (count,)), strict=True):
-            tensor = tensors[name]
-            if (
-                tensor.dtype != torch.float32
-                or tensor.shape != shape
-                or not bool(((tensor >= 0) & (tensor <= 1)).all())
-            ):
-                raise ValueError(f"{name} is not a share of each triangle")
-        return Coverage(**{name: tensors[name] for name in _FIELDS})
+        if len(tensors["seen"]) != len(face_model.faces):
+            raise ValueError("it has another number of triangles")
+        return Coverage(**tensors)
 
 
 def filmed_share(vertices: Float[Tensor, "v 3"], face_model: FaceModel, coverage: Coverage, camera: Camera) -> float:

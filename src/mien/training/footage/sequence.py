@@ -1,5 +1,6 @@
 """Sequence: what training needs of one filmed sequence, and the target pictures."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -115,23 +116,17 @@ class Target:
 
     def pinned(self) -> "Target":
         """This target in pinned memory, which a GPU can read asynchronously."""
-        return replace(
-            self,
-            picture=self.picture.pin_memory(),
-            matte=self.matte.pin_memory(),
-            background=self.background.pin_memory(),
-            hidden=None if self.hidden is None else self.hidden.pin_memory(),
-        )
+        return self._each(Tensor.pin_memory)
 
     def to(self, like: Tensor) -> "Target":
         """This target on the device of `like`, with a background of its dtype. The copies are asynchronous."""
-        return replace(
-            self,
-            picture=self.picture.to(like.device, non_blocking=True),
-            matte=self.matte.to(like.device, non_blocking=True),
-            background=self.background.to(like, non_blocking=True),
-            hidden=None if self.hidden is None else self.hidden.to(like.device, non_blocking=True),
-        )
+        moved = self._each(lambda own: own.to(like.device, non_blocking=True))
+        return replace(moved, background=self.background.to(like, non_blocking=True))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "Target":
+        hidden = None if self.hidden is None else change(self.hidden)
+        tensors = (change(self.picture), change(self.matte), self.box, change(self.background))
+        return Target(*tensors, self.parts, hidden)
 
 
 class Targets:

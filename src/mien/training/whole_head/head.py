@@ -7,7 +7,6 @@ is inside a head explains only what the mesh shows of it. The trainer calls a `W
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import replace
-from typing import TypeVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -30,7 +29,6 @@ from mien.training.whole_head.side_views import SideView, SideViews, side_views_
 from mien.training.whole_head.unseen import Unseen, fills_sides, spare_fills, unseen_of
 
 HAIR_EVERY = 8  # number of training frames from one correction of the hair's surface to the next
-_Made = TypeVar("_Made")
 
 
 class WholeHead:
@@ -79,14 +77,15 @@ class WholeHead:
         return weights if self.unseen is None else self.unseen.weights(weights)
 
     def before_step(
-        self, batch: Items[BatchFrame], meanwhile: Callable[[Callable[[], _Made]], Callable[[], _Made]]
+        self, batch: Items[BatchFrame], meanwhile: Callable[[Callable[[], SideView]], Callable[[], SideView]]
     ) -> None:
         """Fill the mouth if it is due, and begin a side view if one of the frames is due for it.
 
         `meanwhile` lets another thread call a function, and returns what waits for its result.
         """
-        for one in batch if self._interior is not None else ():
-            fill_interior(self._surface, self._avatar.face_model, self._interior, one.number, self._settings.steps)
+        if self._interior is not None:
+            for one in batch:
+                fill_interior(self._surface, self._avatar.face_model, self._interior, one.number, self._settings.steps)
         side_views, self._next_view = self.side_views, None
         due = [] if side_views is None else [one for one in batch if side_views.due(one.number)]
         if side_views is not None and due:

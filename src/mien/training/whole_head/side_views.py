@@ -9,7 +9,6 @@ pulled towards those of the mesh. In raised expressions, a difference that a rea
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -50,8 +49,8 @@ outline. Measured: 10 has 0.4 dB less at 30 degrees, 1 has 0.3 less at 90 (log, 
 
 
 @dataclass(frozen=True, eq=False)
-class SideViewPlan:
-    """A side view without the pictures that it is compared with."""
+class SideView:
+    """A side view and the pictures that it is compared with, which are on the CPU."""
 
     face: FaceParams
     """The turned head, or the raised expression. It has no gradient."""
@@ -59,18 +58,6 @@ class SideViewPlan:
     """Whether the expression is raised."""
     camera: Camera
     background: Float[Tensor, " 3"]
-    """A colour, on the CPU."""
-    vertices: Float[Tensor, "v 3"]
-    """The posed mesh in world coordinates, on the CPU."""
-    up: Float[Tensor, " 3"]
-    """The head's upright axis in world coordinates, on the CPU."""
-
-
-@dataclass(frozen=True, eq=False)
-class SideView:
-    """A side view with its pictures, which are on the CPU."""
-
-    plan: SideViewPlan
     picture: Float[Tensor, "h w 3"]
     """The completed mesh over the background."""
     alpha: Float[Tensor, "h w"]
@@ -124,35 +111,39 @@ class SideViews:
         # Threads share the core's pool, and a loop of one makes those of the other serial. So the mesh is posed here.
         posed = self.face_model(face.to(self.colors))[0]
         up = face.T_world_head[0, :3, 1].to(self.colors)
-        return partial(self._made, SideViewPlan(face, raised, small, background, posed, up))
+
+        @torch.no_grad()
+        def make() -> SideView:
+            return SideView(face, raised, small, background, *self._pictures(posed, up, small, background))
+
+        return make
 
     def loss(self, avatar: Avatar, view: SideView, progress: Progress) -> Float[Tensor, ""]:
         """The weighted difference between the avatar and the completed mesh in one side view."""
-        plan, like = view.plan, view.plan.face.expression
-        posed = avatar.pose(plan.face, progress)
-        seen = rasterize(posed.gaussians.timestep(0), plan.camera, plan.background.to(like))
+        like, posed = view.face.expression, avatar.pose(view.face, progress)
+        seen = rasterize(posed.gaussians.timestep(0), view.camera, view.background.to(like))
         difference = (seen.image - view.picture.to(like)).abs()
-        if plan.raised:
+        if view.raised:
             free = _RAISED_FREE_DIFFERENCE
             difference = (difference - free).clamp_min(0) * view.compared.to(like)[..., None]
             return self.weight * difference.mean() + _held_back(avatar, posed, self.compared)
         outline = _SIDE_VIEWS_OUTLINE_WEIGHT * (seen.alpha - view.alpha.to(like)).abs().mean()
         return self.weight * (difference.mean() + outline)
 
-    @torch.no_grad()
-    def _made(self, plan: SideViewPlan) -> SideView:
-        camera, faces = plan.camera.to(self.colors), self.face_model.faces
-        raised = plan.vertices + self.height[:, None] * vertex_normals(plan.vertices, faces)
+    def _pictures(
+        self, vertices: Float[Tensor, "v 3"], up: Float[Tensor, " 3"], camera: Camera, background: Float[Tensor, " 3"]
+    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """Picture, alpha and compared pixels, given the posed mesh and the head's upright axis in the world."""
+        camera, faces = camera.to(self.colors), self.face_model.faces
+        raised = vertices + self.height[:, None] * vertex_normals(vertices, faces)
         index = rasterize_mesh(raised, faces, camera).face_index.long()
         matte = np.where(index.numpy() >= 0, 255, 0).astype(np.uint8)
-        cut = fit_neck_cut(self.neck, plan.vertices, plan.up)
-        mask = head_mask(matte, camera, plan.vertices, self.head_faces, cut)
-        alpha = torch.from_numpy(mask).float() / 255
+        cut = fit_neck_cut(self.neck, vertices, up)
+        alpha = torch.from_numpy(head_mask(matte, camera, vertices, self.head_faces, cut)).float() / 255
         triangle: Int[Tensor, " p"] = index.clamp_min(0).flatten()
         colors = self.colors.index_select(0, triangle).view(*index.shape, 3)
-        picture = plan.background + alpha[..., None] * (colors - plan.background)
-        compared = self.compared.index_select(0, triangle).view(index.shape) & (alpha > 0)
-        return SideView(plan, picture, alpha, compared)
+        picture = background + alpha[..., None] * (colors - background)
+        return picture, alpha, self.compared.index_select(0, triangle).view(index.shape) & (alpha > 0)
 
     def raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
