@@ -69,13 +69,11 @@ class Recorded:
     times: list[Any]
     """What each frame has as its time. None if it has none."""
     time_key: str
-    """Name of the times."""
     units: float
     """Units of the times in a second."""
     fps: float | None = None
     """Frames per second, if the file states them."""
     notes: tuple[str, ...] = ()
-    """Lines for the user."""
 
 
 def _recorded(content: Any, path: Path) -> Recorded:

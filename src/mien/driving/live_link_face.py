@@ -64,11 +64,9 @@ _EXCHANGED = {"jawLeft": "jawRight", "jawRight": "jawLeft", "mouthLeft": "mouthR
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     """Read motion from a csv of Live Link Face, or of any program that has ARKit's names and a column of times.
 
-    Rows without a face (count 0) repeat the row before.
-
-    `fps` are frames per second of the timecode, or rows a second where its frame field never changes and where there is
-    no timecode. The default is the smallest usual rate above its highest frame number, or 60 for takes of less than a
-    second.
+    Rows without a face (count 0) repeat the row before. `fps` are frames per second of the timecode, or rows a second
+    where its frame field never changes and where there is no timecode. The default is the smallest usual rate above its
+    highest frame number, or 60 for takes of less than a second.
     """
     header, lines = _read_rows(path)
     columns = {_canonical(name): index for index, name in enumerate(header)}
