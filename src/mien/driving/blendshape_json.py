@@ -288,10 +288,8 @@ def _row(scores: Scores, where: str) -> Float[np.ndarray, " 52"]:
 
 
 def _place_heads(rows: Float[np.ndarray, "t 58"], matrices: list[np.ndarray | None], path: Path) -> tuple[str, ...]:
-    """Fill in rotations and translations of heads. Returns a line for the user if the matrices are transposed.
-
-    A matrix without translation says nothing about its form, so all matrices of the file decide together.
-    """
+    """Fill in rotations and translations of heads. Returns a line for the user if the matrices are transposed."""
+    # A matrix without translation says nothing about its form, so all matrices of the file decide together.
     given = [(index, matrix) for index, matrix in enumerate(matrices) if matrix is not None]
     transposed = not all(has_last_row(matrix) for _, matrix in given) and all(has_last_row(m.T) for _, m in given)
     for index, matrix in given:

@@ -49,7 +49,7 @@ class Driver:
     found: FaceParams | None = None
     """The timesteps in which a face was found, at the recording's own times. None if they are those of `face`."""
     ahead: Float[Tensor, "3 3"] | None = None
-    """R_world_head of a head that looks at the camera. The identity if None."""
+    """R_world_head of a head that looks at the camera, or the identity."""
     rest_is: str = _CALM
     """What `at_rest` is, for messages."""
 

@@ -32,8 +32,8 @@ MAX_MOMENTS = 500_000  # in a recording: about two hours at 60 per second
 MAX_FILE_BYTES = 128 << 20  # largest recording that is read. An hour of Live Link Face has about this size
 _SLOWEST = 5.0  # least number of moments a second of a recording of a face
 _SHORTEST, _LONGEST = 1 / 500, 3.0  # seconds between two moments. A median beyond them means another unit
+# Coefficients go from 0 to 1, and a little beyond in programs that calibrate or exaggerate.
 MIN_COEFFICIENT, MAX_COEFFICIENT = -0.5, 1.5
-"""Bounds of a coefficient. They go from 0 to 1, and a little beyond in programs that calibrate or exaggerate."""
 
 
 @dataclass(frozen=True, eq=False)

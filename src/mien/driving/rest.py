@@ -37,10 +37,9 @@ _OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """A face at rest."""
+    """A face at rest, as one timestep."""
 
     face: FaceParams
-    """One timestep."""
     moved: tuple[str, ...] = ()
     """What was too far from the model's neutral, and counts as motion, with its size."""
 

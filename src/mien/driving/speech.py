@@ -20,8 +20,7 @@ from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 _SPEECH_WINDOW = 0.04
 """Length of the pieces of sound that are measured, in seconds. Bands, weights, smoothing, exponent and drops were
 chosen on 5 English sentences of 4 voices of a synthesiser, and judged on others (docs/using.md, "A voice")."""
-SPEECH_BANDS = ((500.0, 900.0), (1400.0, 3000.0))
-"""Bands in Hz in which open vowels are louder than closed ones: one of the first of their formants, one above."""
+SPEECH_BANDS = ((500.0, 900.0), (1400.0, 3000.0))  # Hz: of the first formants of open vowels, and above
 SPEECH_BAND_WEIGHTS = (1.0, 0.5)  # how much the share of each band counts, in dB, beside the loudness
 SPEECH_LEAST_SHARE = 10**-2.5  # smallest share of the energy that a band counts with
 _SPEECH_SMOOTHING = 0.02  # deviation of the smoothing over time, in seconds: even before and after, so without lag
