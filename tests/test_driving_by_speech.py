@@ -10,7 +10,7 @@ import pytest
 from mien.cli import main
 from mien.driving.drivers import Driver
 from mien.driving.motion import ARKIT_NAMES
-from mien.driving.speech import FPS, motion_of_sound, read_speech
+from mien.driving.speech import FPS, motion_of_sound
 from mien.face import load_face_model
 from mien.media.video import RATE, count_frames, read_sound, read_video_frames, write_video
 from mien.pipeline import drive as driving
@@ -181,7 +181,7 @@ def test_files_without_sound_and_odd_rates_are_refused(tmp_path: Path) -> None:
         ("film.mp4", "has no sound; give a file with sound"), ("0.wav", r"\.wav: .*convert it to \.wav"),
         ("999.wav", r"\.wav: .*convert it to \.wav"), ("2000000.wav", r"\.wav: .*convert it to \.wav"),
     ):  # fmt: skip
-        refuses(message, read_speech, tmp_path / name)
+        refuses(message, read_sound, tmp_path / name)
 
 
 @pytest.mark.unchecked

@@ -16,7 +16,7 @@ from mien.capture.cameras.calibration import read_calibration
 from mien.capture.person.given import read_landmarks
 from mien.commands.batch_table import read_table
 from mien.commands.train_options import read_config_file
-from mien.driving.speech import read_speech
+from mien.driving.speech import motion_of_sound
 from mien.evaluation.image_folders import read_crops
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import read_metrics
@@ -28,6 +28,7 @@ from mien.formats.glb import read_glb_avatar
 from mien.formats.sog import read_sog
 from mien.formats.spz import read_spz
 from mien.formats.usd import read_usd
+from mien.media.video import read_sound
 from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
 from mien.tracking import read_tracking
@@ -144,7 +145,7 @@ _TARGETS = (
     Target("take.csv", "given/take.csv", uses.read_motion, uses.expect_motion, 2),
     Target("take.json", "given/*take.json", uses.read_motion, uses.expect_motion, 2),
     Target("takes", "takes/*", uses.read_motion, uses.expect_motion, 4),
-    Target("sounds", "sounds/*", _of(read_speech), uses.expect_motion, 3),
+    Target("sounds", "sounds/*", _of(lambda path: motion_of_sound(read_sound(path))), uses.expect_motion, 3),
     Target("tables", "tables/people*", _of(read_table), commands.run_batch, 3),
     Target("states of a batch", "batch/states/*", commands.read_batch, commands.run_batch, 2, named=False,
            parts=("tables",)),

@@ -76,14 +76,10 @@ def capture_cameras(
     the faces in all pictures, and every camera is cropped to it, so a camera behind the head needs no face. Unfinished
     work of an interrupted run is continued.
 
-    Args:
-        sources: a video or a folder of pictures for each camera, named by the camera's id; or one folder with them.
-        calibration: json file of the cameras (`mien.capture.cameras.calibration.read_calibration`).
-        out: the capture's folder. A capture of the same sources in it is replaced; anything else is refused.
-        name: name of the sequence.
-        settings: mattes, landmarks and clean plates are folders with a file or folder for each camera, named by its
-            id. Cuts are not searched.
-        replace_others: whether a capture of other sources may be replaced.
+    `sources` are a video or a folder of pictures for each camera, named by its id, or one folder with them, and
+    `calibration` is the json file of the cameras (`read_calibration`). Mattes, landmarks and clean plates of the
+    settings are folders with a file or folder for each camera, named by its id; cuts are not searched. A capture of the
+    same sources in `out` is replaced, and with `replace_others` one of others; anything else is refused.
     """
     settings = settings or CaptureSettings()
     cameras = read_calibration(calibration)

@@ -35,8 +35,7 @@ from mien.machine.terminal import counted
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
 _OWN_NAMES = frozenset({JSON_NAME, ARRAYS_NAME, REPORT_NAME, FRAMES, MATTES, CACHE})
-_QUALITY = ("sharpness", "brightness", "clipped")
-"""Arrays that are there if the faces were measured."""
+_QUALITY = ("sharpness", "brightness", "clipped")  # arrays that are there if the faces were measured
 _ARRAYS = {
     "timestamps": ("t", np.float64),
     "landmarks": ("tcl2", np.float32),

@@ -69,13 +69,11 @@ class Recorded:
     times: list[Any]
     """What each frame has as its time. None if it has none."""
     time_key: str
-    """Name of the times."""
     units: float
     """Units of the times in a second."""
     fps: float | None = None
     """Frames per second, if the file states them."""
     notes: tuple[str, ...] = ()
-    """Lines for the user."""
 
 
 def _recorded(content: Any, path: Path) -> Recorded:
@@ -290,10 +288,8 @@ def _row(scores: Scores, where: str) -> Float[np.ndarray, " 52"]:
 
 
 def _place_heads(rows: Float[np.ndarray, "t 58"], matrices: list[np.ndarray | None], path: Path) -> tuple[str, ...]:
-    """Fill in rotations and translations of heads. Returns a line for the user if the matrices are transposed.
-
-    A matrix without translation says nothing about its form, so all matrices of the file decide together.
-    """
+    """Fill in rotations and translations of heads. Returns a line for the user if the matrices are transposed."""
+    # A matrix without translation says nothing about its form, so all matrices of the file decide together.
     given = [(index, matrix) for index, matrix in enumerate(matrices) if matrix is not None]
     transposed = not all(has_last_row(matrix) for _, matrix in given) and all(has_last_row(m.T) for _, m in given)
     for index, matrix in given:

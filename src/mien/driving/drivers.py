@@ -18,7 +18,7 @@ from mien.driving.expression_map import fit_expression_map
 from mien.driving.live_link_face import read_live_link_face
 from mien.driving.motion import check_times
 from mien.driving.rest import facing, rest_of
-from mien.driving.speech import read_speech
+from mien.driving.speech import motion_of_sound
 from mien.driving.transfer import face_of_motion
 from mien.errors import UserError
 from mien.face.loading import load_face_model
@@ -26,6 +26,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate, most_frontal_camera
 from mien.machine.progress import say
 from mien.media.output import SOUND_ENDINGS
+from mien.media.video import read_sound
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.training.footage.sequence import Sequence, read_sequence
 
@@ -48,7 +49,7 @@ class Driver:
     found: FaceParams | None = None
     """The timesteps in which a face was found, at the recording's own times. None if they are those of `face`."""
     ahead: Float[Tensor, "3 3"] | None = None
-    """R_world_head of a head that looks at the camera. The identity if None."""
+    """R_world_head of a head that looks at the camera, or the identity."""
     rest_is: str = _CALM
     """What `at_rest` is, for messages."""
 
@@ -64,7 +65,7 @@ def read_recording(path: Path, face_model: FaceModel, fps: float | None = None) 
     if suffix == ".csv":
         motion = read_live_link_face(path, fps)
     else:
-        motion = read_blendshape_json(path) if suffix == ".json" else read_speech(path)
+        motion = read_blendshape_json(path) if suffix == ".json" else motion_of_sound(read_sound(path))
     for note in motion.notes:
         say(note)
     if motion.lost:

@@ -80,7 +80,6 @@ class FollowOptions:
     """How an avatar follows."""
 
     head_pose: bool = True
-    """Whether the head follows the person's."""
     unlimited: bool = False
     """Whether the avatar follows also beyond what it was filmed with."""
 

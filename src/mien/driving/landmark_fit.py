@@ -25,8 +25,7 @@ from mien.tracking.landmarks.stages import FIRST_OUTLIER
 from mien.tracking.landmarks.term import LANDMARK_SIGMA
 from mien.tracking.settings import TrackingSettings
 
-_LIVE_STEP = 0.5
-"""Part of a coefficient over which landmarks are taken as linear; for joints, in radians, a quarter of that."""
+_LIVE_STEP = 0.5  # of a coefficient, over which landmarks count as linear; for joints, in radians, a quarter of that
 _LIVE_OUTLIER = 6.0
 """Outlier threshold in standard deviations. Measured: 20 has the same mean correlation to 0.001 (log, 11-23)."""
 _LIVE_STEPS = 2
@@ -190,8 +189,7 @@ class LandmarkFit:
 
     def _find_pose(self, start: Fitted, centered: Float[np.ndarray, "l 2"], focal: float) -> Fitted:
         """The head pose from landmarks that expressions hardly move."""
-        outlier, steps = FIRST_OUTLIER, _LIVE_FIRST_STEPS
-        return self._descend(start, centered, focal, self._rigid, outlier, steps, pose_only=True)
+        return self._descend(start, centered, focal, self._rigid, FIRST_OUTLIER, _LIVE_FIRST_STEPS, pose_only=True)
 
     def _descend(
         self,

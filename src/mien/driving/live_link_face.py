@@ -50,8 +50,7 @@ _TIMECODE = re.compile(r"([0-9]{1,4}):([0-9]{1,2}):([0-9]{1,2})[:;]([0-9]{1,4})(
 _RATES = (24, 25, 30, 48, 50, 60, 90, 120, 240)
 _DAY = 86_400  # seconds. A timecode that goes back by more than half of them has passed midnight
 _TIMECODE_NAME, _FRAME = "timecode", "frame"
-_UNITS = {"timestamp_ms": 1000.0, "timestampms": 1000.0, "time": 1.0}
-"""Columns of times in the file's own clock, and their units in a second."""
+_UNITS = {"timestamp_ms": 1000.0, "timestampms": 1000.0, "time": 1.0}  # columns of times, and their units in a second
 _ASSUMED_RATE = 30.0  # rows a second of a table that has only frame numbers
 _MAX_TURN, _MAX_SPEED = 1.7, 20.0
 """Largest yaw and pitch of a head or an eye that a camera sees, in radians, and largest speed of a head in radians a
@@ -64,13 +63,17 @@ _EXCHANGED = {"jawLeft": "jawRight", "jawRight": "jawLeft", "mouthLeft": "mouthR
 def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
     """Read motion from a csv of Live Link Face, or of any program that has ARKit's names and a column of times.
 
-    Rows without a face (count 0) repeat the row before.
-
-    `fps` are frames per second of the timecode, or rows a second where its frame field never changes and where there is
-    no timecode. The default is the smallest usual rate above its highest frame number, or 60 for takes of less than a
-    second.
+    Rows without a face (count 0) repeat the row before. `fps` are frames per second of the timecode, or rows a second
+    where its frame field never changes and where there is no timecode. The default is the smallest usual rate above its
+    highest frame number, or 60 for takes of less than a second.
     """
-    header, lines = _read_rows(path)
+    try:
+        rows = list(table_rows(open_recording(path)))
+    except (OSError, ValueError, csv.Error) as error:
+        raise UserError(f"{path}: cannot be read as csv ({error}); give a csv of Live Link Face") from None
+    if len(rows) < 2:
+        raise UserError(f"{path}: has no frames; give a csv of Live Link Face with a header and one row for each frame")
+    (_, header), *lines = rows
     columns = {_canonical(name): index for index, name in enumerate(header)}
     notes = _check_columns(path, columns)
     names = [name for name in (*ARKIT_NAMES, *HEAD, *EYES) if name in columns]
@@ -105,9 +108,7 @@ def read_live_link_face(path: Path, fps: float | None = None) -> Motion:
 
 def _canonical(name: str) -> str:
     """A column's name as ARKit or the app spells it, or in lower case."""
-    name = name.strip()
-    lower = name.lower()
-    place = arkit_index(name)
+    place, lower = arkit_index(name.strip()), name.strip().lower()
     return _SPELLINGS.get(lower, lower) if place is None else ARKIT_NAMES[place]
 
 
@@ -133,17 +134,6 @@ def _check_columns(path: Path, columns: dict[str, int]) -> tuple[str, ...]:
             "names)"
         )
     return (f"{path}: has no columns {shown} ({len(missing)} in all), so they stay 0",) if missing else ()
-
-
-def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The header, and all further rows that are not empty, with their line numbers."""
-    try:
-        rows = list(table_rows(open_recording(path)))
-    except (OSError, ValueError, csv.Error) as error:
-        raise UserError(f"{path}: cannot be read as csv ({error}); give a csv of Live Link Face") from None
-    if len(rows) < 2:
-        raise UserError(f"{path}: has no frames; give a csv of Live Link Face with a header and one row for each frame")
-    return rows[0][1], rows[1:]
 
 
 def _number(path: Path, line: int, name: str, text: str) -> float:

@@ -26,15 +26,14 @@ ARKIT_NAMES = (
 )  # fmt: skip
 """ARKit's 52 blend shapes, in the order of Live Link Face's columns. Left and right are the performer's."""
 PAIRS = tuple((name, name[:-4] + "Right") for name in ARKIT_NAMES if name.endswith("Left"))
-"""All directional coefficients, as pairs of left and right."""
 
 MAX_GAP_SECONDS = 60.0  # longest gap between two moments that is interpolated. A longer one means another recording
 MAX_MOMENTS = 500_000  # in a recording: about two hours at 60 per second
 MAX_FILE_BYTES = 128 << 20  # largest recording that is read. An hour of Live Link Face has about this size
 _SLOWEST = 5.0  # least number of moments a second of a recording of a face
 _SHORTEST, _LONGEST = 1 / 500, 3.0  # seconds between two moments. A median beyond them means another unit
+# Coefficients go from 0 to 1, and a little beyond in programs that calibrate or exaggerate.
 MIN_COEFFICIENT, MAX_COEFFICIENT = -0.5, 1.5
-"""Bounds of a coefficient. They go from 0 to 1, and a little beyond in programs that calibrate or exaggerate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,34 +70,17 @@ def gaze_of(coefficients: Float32[np.ndarray, "t 52"]) -> Float32[np.ndarray, "t
     return eyes
 
 
-def _resample_evenly(
-    seconds: Float[np.ndarray, " r"], rows: Float[np.ndarray, "r c"]
-) -> tuple[float, Float[np.ndarray, "t c"]]:
-    """Return frames per second, and rows at evenly spaced times, interpolated linearly unless they are even already."""
-    if len(rows) < 2:
-        return 30.0, rows
-    step = float(np.median(np.diff(seconds)))
-    count = round((seconds[-1] - seconds[0]) / step) + 1
-    even = seconds[0] + step * np.arange(count)
-    if count == len(rows) and np.abs(even - seconds).max() < 0.5 * step:
-        return (len(rows) - 1) / float(seconds[-1] - seconds[0]), rows
-    return 1 / step, np.stack([np.interp(even, seconds, column) for column in rows.T], axis=1)
-
-
 @dataclass(frozen=True)
 class Times:
-    """A file's names for its times, and how messages name them."""
+    """A file's name for its times, and what messages say of them; `where` names a row's place in the file."""
 
     name: str
-    """Name of the times."""
     where: Callable[[int], str]
-    """Returns the name of a row's place in the file."""
     units: float | None = None
     """Units of the times in a second. None for times that cannot have another unit, such as a timecode."""
     slack: float = 0.0
     """How far a time may go back to count as a repeat, in seconds."""
     remedy: str = ""
-    """End of the message for times that go back."""
     faster: str = "correct its times"
     """The remedy where there are too few rows a second."""
 
@@ -109,7 +91,7 @@ def evenly_timed(
     """Return frames per second, rows at evenly spaced times, the number of rows without a face, and lines for the user.
 
     Rows that repeat a time are left out. Rows without a face (not `found`) repeat the last one before them, or at the
-    start the first one with a face.
+    start the first one with a face. Rows at uneven times are interpolated linearly.
     """
     kept, notes = _without_repeats(seconds, times)
     if times.units is not None:
@@ -117,7 +99,15 @@ def evenly_timed(
     check_times(seconds[kept], lambda index: times.where(int(kept[index])))
     last = np.maximum.accumulate(np.where(found, np.arange(len(rows)), -1))
     filled = rows[np.where(last < 0, int(np.argmax(found)), last)]
-    fps, even = _resample_evenly(seconds[kept], filled[kept])
+    fps, even, at = 30.0, filled[kept], seconds[kept]
+    if len(kept) > 1:
+        step = float(np.median(np.diff(at)))
+        count = round((at[-1] - at[0]) / step) + 1
+        moments = at[0] + step * np.arange(count)
+        if count == len(kept) and np.abs(moments - at).max() < 0.5 * step:
+            fps = (len(kept) - 1) / float(at[-1] - at[0])
+        else:
+            fps, even = 1 / step, np.stack([np.interp(moments, at, column) for column in even.T], axis=1)
     if len(kept) > 1 and fps < _SLOWEST:
         line = (
             f"{path}: has {fps:.2g} rows a second, and recordings of faces have at least {_SLOWEST:g}; {times.faster}"

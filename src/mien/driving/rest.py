@@ -30,18 +30,16 @@ REST_GAZE = (0.262, 0.384)
 """The same for the angle of the gaze, in radians: 15 and 22 degrees. Eyes that look ahead or into the camera are at
 rest however the head is turned. Measured: 11 degrees at most, 12 on drawn people."""
 _REST_JAW = (0.12, 0.24)  # the same for a jaw that is a joint, in radians
-_REST_SIGMAS_OF_ONE = 5.0
-"""Standard deviations of a face model's coefficient that count as 1 of ARKit, so that the limits are 1.5 and 3."""
+_REST_SIGMAS_OF_ONE = 5.0  # deviations of a model's coefficient that count as 1 of ARKit: the limits are 1.5 and 3
 
 _OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """A face at rest."""
+    """A face at rest, as one timestep."""
 
     face: FaceParams
-    """One timestep."""
     moved: tuple[str, ...] = ()
     """What was too far from the model's neutral, and counts as motion, with its size."""
 

@@ -9,48 +9,37 @@ mouth is wide and less open; where it is at low ones (o, u), the lips are rounde
 """
 
 import math
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from mien.driving.motion import ARKIT_NAMES, Motion
-from mien.media.video import RATE, read_sound
+from mien.media.video import RATE
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 _SPEECH_WINDOW = 0.04
 """Length of the pieces of sound that are measured, in seconds. Bands, weights, smoothing, exponent and drops were
 chosen on 5 English sentences of 4 voices of a synthesiser, and judged on others (docs/using.md, "A voice")."""
-SPEECH_BANDS = ((500.0, 900.0), (1400.0, 3000.0))
-"""Bands in Hz in which open vowels are louder than closed ones: one of the first of their formants, one above."""
+SPEECH_BANDS = ((500.0, 900.0), (1400.0, 3000.0))  # Hz: of the first formants of open vowels, and above
 SPEECH_BAND_WEIGHTS = (1.0, 0.5)  # how much the share of each band counts, in dB, beside the loudness
 SPEECH_LEAST_SHARE = 10**-2.5  # smallest share of the energy that a band counts with
-_SPEECH_SMOOTHING = 0.02
-"""Standard deviation of the smoothing over time, in seconds. It is even before and after, so there is no lag."""
+_SPEECH_SMOOTHING = 0.02  # deviation of the smoothing over time, in seconds: even before and after, so without lag
 _SPEECH_FLOOR = 10  # percentile of the level that is the noise floor
 _SPEECH_LOUD = 95  # percentile of the level that is a loud voice
 _SPEECH_RANGE = (25.0, 45.0)  # bounds of the distance from the noise floor to a loud voice, in dB
 _SPEECH_GATE = 0.15  # share of this distance above the noise floor that still counts as silence
-_SPEECH_SILENCE = -55.0
-"""Loudness of silence in dB, where 0 is the loudest possible. Files that are never louder do not move the mouth."""
+_SPEECH_SILENCE = -55.0  # dB, where 0 is the loudest possible. Files that are never louder do not move the mouth
 _SPEECH_EXPONENT = 2.0  # exponent from the level in dB to opening
 _SPEECH_SPLIT = (700.0, 2500.0)  # frequencies in Hz below which sound is low, and above which it is high
 _SPEECH_SHUT_WITHIN = 0.14  # time within which sound is as loud before and after a drop at which lips shut, in seconds
-_SPEECH_SHUT_DROP = (14.0, 26.0)
-"""Drops of the level in dB from which on lips begin to shut, and at which they are shut. No real speech was
-compared."""
+_SPEECH_SHUT_DROP = (14.0, 26.0)  # drops in dB at which lips begin to shut, and are shut. No real speech was compared
 _SPEECH_SHUT_HISS = 6.0  # how much energy at high frequencies keeps lips open, as at s: from its inverse on, they are
 _SPEECH_SHUT_BESIDE = 0.3  # how shut lips are in the picture before and after that in which they are shut
 FPS = 30.0  # moments a second of the motion
 
 
-def read_speech(path: Path) -> Motion:
-    """The motion for a file with sound. The same file gives the same motion."""
-    return motion_of_sound(read_sound(path))
-
-
 def motion_of_sound(samples: Float32[np.ndarray, " n"]) -> Motion:
-    """The motion for a sound with one channel and `mien.media.video.RATE` samples a second, -1..1."""
+    """The motion for a sound as `mien.media.video.read_sound` reads it. The same sound gives the same motion."""
     count = max(1, math.ceil(len(samples) / RATE * FPS))
     loudness, level, low, high = _measured(samples, count)
     shut = _shut(level, high)

@@ -51,8 +51,7 @@ _P3_TO_BT709 = np.array(
     [[1.224940, -0.224940, 0.0], [-0.042057, 1.042057, 0.0], [-0.019638, -0.078636, 1.098274]], np.float32
 )
 """Both have the white D65."""
-_WIDE = {9: _BT2020_TO_BT709, 12: _P3_TO_BT709}
-"""Matrices to BT.709 by the code of the primaries (ITU-T H.273)."""
+_WIDE = {9: _BT2020_TO_BT709, 12: _P3_TO_BT709}  # matrices to BT.709 by the code of the primaries (ITU-T H.273)
 _BT2020_LUMA = np.array([[0.2627, 0.6780, 0.0593]], np.float32)
 
 

@@ -23,8 +23,7 @@ _MAX_SCANS = 200
 _NO_FRAMES = (0xC4, 0xC8, 0xCC)  # markers between 0xC0 and 0xCF that start no JPEG frame
 _TIFF_STARTS = (b"II\x2a\0", b"MM\0\x2a", b"II\x2b\0", b"MM\0\x2b")
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-_TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)
-"""TIFF tags of the picture's size and of its tiles' size."""
+_TIFF_WIDTHS, _TIFF_HEIGHTS = (256, 322), (257, 323)  # TIFF tags of the picture's size and of its tiles' size
 
 
 def decode_picture(path: Path, flags: int) -> np.ndarray | None:

@@ -8,8 +8,7 @@ from jaxtyping import Float32, UInt8
 
 _ROWS = 512  # converted at a time. An 8192x8192 picture would otherwise be in memory four times
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_COLORS = {3: 2, 4: 6}
-"""Channels -> colour type of a PNG (W3C PNG, table 11.1): RGB, and RGB with alpha."""
+_PNG_COLORS = {3: 2, 4: 6}  # channels -> colour type of a PNG (W3C PNG, table 11.1): RGB, and RGB with alpha
 _PNG_UP = 2  # filter of a row: its difference to the row above
 
 

@@ -37,8 +37,7 @@ from mien.media.video_file import (
 _THREADS = 2
 DEFAULT_FPS = 25.0
 """Frames a second of a stream that names no rate."""
-_WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-"""Decoders that read the alpha of a codec, if others do not."""
+_WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # decoders that read the alpha of a codec, if others do not
 
 
 @dataclass(frozen=True)
@@ -177,13 +176,9 @@ def write_video(
 ) -> None:
     """Write sRGB frames of one size as H.264, atomically. They are read once, so a generator will do.
 
-    Args:
-        path: path of the video. Its ending, usually .mp4, chooses the container.
-        frames: the frames.
-        fps: frames per second.
-        crf: x264's constant rate factor: 0 is lossless, 18 looks lossless, 51 is worst.
-        preset: x264's preset. `veryfast` takes a third of the time and compresses somewhat worse.
-        sound: a file with sound for the video, and the video's length in seconds.
+    The path's ending, usually .mp4, chooses the container. `crf` is x264's constant rate factor: 0 is lossless, 18
+    looks lossless, 51 is worst. The preset `veryfast` takes a third of the time and compresses somewhat worse. `sound`
+    is a file with sound for the video, and the video's length in seconds.
     """
     # x264's macroblock tree reads memory that it has not written, so equal pictures could give different files.
     encode(path, frames, fps, "libx264", {"crf": str(crf), "preset": preset, "mbtree": "0"}, sound)
@@ -303,8 +298,7 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
 RATE = 16_000
 """Samples a second of `read_sound`."""
 _MOST_SECONDS = 3600.0
-_LEAST_RATE, _MOST_RATE = 1_000, 768_000
-"""Bounds of the samples a second of a file."""
+_LEAST_RATE, _MOST_RATE = 1_000, 768_000  # bounds of the samples a second of a file
 _WRITTEN_RATE = 48_000
 
 

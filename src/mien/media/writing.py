@@ -17,8 +17,7 @@ from mien.media.video import encode, write_video
 
 _FRINGE = 8
 """Distance in pixels over which colours are spread beyond the opaque part: video halves the resolution of colour."""
-_WEBM_QUALITY = 24
-"""VP9's constant quality, from 0 (lossless) to 63 (worst)."""
+_WEBM_QUALITY = 24  # VP9's constant quality, from 0 (lossless) to 63 (worst)
 
 
 def write_pictures(

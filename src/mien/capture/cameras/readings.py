@@ -31,8 +31,7 @@ _OTHER_SIZE = 0.15
 """Relative distance of a principal point from the middle at which intrinsics may be for another size of pictures."""
 _OFF = 0.05
 """Distance of a principal point from the middle, in heights, below which it does not matter from where y counts."""
-_RATIOS = (5 / 4, 4 / 3, 3 / 2, 2.0, 9 / 4, 5 / 2, 8 / 3, 3.0, 4.0, 9 / 2, 6.0)
-"""Usual ratios of two sizes of pictures."""
+_RATIOS = (5 / 4, 4 / 3, 3 / 2, 2.0, 9 / 4, 5 / 2, 8 / 3, 3.0, 4.0, 9 / 2, 6.0)  # usual ratios of two sizes of pictures
 _NEAR = 0.25  # largest relative difference between such a ratio and that of the principal points
 
 _Change = Callable[[Camera], Camera]

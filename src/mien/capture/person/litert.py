@@ -86,8 +86,7 @@ def find_person(network: Network, image: UInt8[np.ndarray, "256 256 3"]) -> Floa
 
 _CELLS: dict[str, tuple[tuple[int, int], ...]] = {"near_faces": ((16, 2), (8, 6)), "far_faces": ((48, 1),)}
 """Grids of a network's guesses: cells along each side, and guesses in each cell."""
-_SAME_FACE = 0.3
-"""Overlap (intersection over union) from which on two guesses are of one face."""
+_SAME_FACE = 0.3  # overlap (intersection over union) from which on two guesses are of one face
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +151,7 @@ def _overlap(box: Float[np.ndarray, "2 2"], others: Float[np.ndarray, "n 2 2"]) 
     return shared / np.maximum(areas - shared, 1e-12)
 
 
-_ROOM = 1.5
-"""Side of the square that the network sees, in sides of the face's box."""
+_ROOM = 1.5  # side of the square that the network sees, in sides of the face's box
 _OUTER_CORNERS = (33, 263)
 """Landmarks whose line is the square's x axis: the outer corners of the right and the left eye."""
 
