@@ -27,25 +27,15 @@ from mien.errors import CannotWriteError, UserError
 if TYPE_CHECKING:
     from torch import Tensor
 
-_KEPT_OF_NAME = 100
-"""Number of characters of a file's name that its temporary name keeps. File systems allow 255 bytes in all."""
-_UNREADABLE = (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError, AttributeError)
+_KEPT_OF_NAME = 100  # characters of a file's name that its temporary name keeps; file systems allow 255 bytes in all
+_UNREADABLE = (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError, AttributeError)
 """Errors of a damaged safetensors file. An AttributeError is a type of number that numpy lacks, such as float8."""
 _CHECKSUM = "checksum"
 """Key of the checksum, which covers everything else in a json file, or the header and data of a safetensors file."""
 _ANY_STAGE = "the stage that writes it"
-_AT_CURRENT_FOLDER, _EXCHANGE = -100, 2
-"""AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
-_MAX_JSON_BYTES = 32 << 20
-"""Largest json file that is read, in bytes. The largest that mien writes has some megabytes. Empty lists take twenty
-times the size of their text in memory."""
-_MAX_HEADER_BYTES = 8 << 20
-"""Largest header of a safetensors file, in bytes. Headers that mien writes have some kilobytes."""
-_MAX_TENSORS_BYTES = 1 << 30
-"""Largest safetensors file that is read, in bytes. The largest that mien writes has some hundred megabytes."""
-_PIECE = 1 << 20
-"""Number of bytes that are hashed at a time."""
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_MAX_JSON_BYTES, _MAX_HEADER_BYTES, _MAX_TENSORS_BYTES = 32 << 20, 8 << 20, 1 << 30
+"""Largest json file, header of a safetensors file, and such file that are read. The largest that mien writes have some
+megabytes, some kilobytes, and some hundred megabytes."""
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
@@ -132,14 +122,15 @@ def _exchange(one: Path, other: Path) -> bool:
         rename = ctypes.CDLL(None).renameat2
     except (OSError, AttributeError, TypeError):  # TypeError: Windows
         return False
-    return rename(_AT_CURRENT_FOLDER, os.fsencode(one), _AT_CURRENT_FOLDER, os.fsencode(other), _EXCHANGE) == 0
+    at, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of renameat2(2)
+    return rename(at, os.fsencode(one), at, os.fsencode(other), exchange) == 0
 
 
 def cannot_write(path: Path, error: OSError) -> CannotWriteError:
     """The error for a failed write of `path`, with a remedy that fits the cause."""
     if isinstance(error, CannotWriteError):
         return error
-    full = error.errno in _FULL
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free disk space and run the same command again" if full else "choose another place"
     return CannotWriteError(f"{path}: cannot be written ({error.strerror or error}); {remedy}", error)
 
@@ -262,7 +253,7 @@ def _check_safetensors(path: Path) -> None:
         if not isinstance(header, dict) or not isinstance(metadata, dict):
             raise ValueError("its header or metadata is not an object")
         stored = metadata.get(_CHECKSUM)
-        if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, _PIECE), b"")):
+        if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, 1 << 20), b"")):
             raise ValueError("its content differs from what was written")
 
 

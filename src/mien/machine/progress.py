@@ -18,7 +18,6 @@ _TRUSTED_SHARE = 0.1
 """Share of a piece after which its own speed tells how long the rest of it takes."""
 _PLAIN_INTERVAL_SECONDS, _WHOLE_INTERVAL_SECONDS = 10.0, 60.0
 """Time between two lines about a bar and about the whole command, if the output is no terminal."""
-_CALLS_BEFORE_ETA = 3
 
 
 @dataclass(frozen=True)
@@ -212,7 +211,7 @@ def _plain_progress(title: str, total: int, completed: int, whole: Overall | Non
         nonlocal told
         elapsed, since_first = time.monotonic() - start, time.monotonic() - first
         # The first item takes longer, because it also loads and warms up what the others use.
-        rate = (done - at_first) / since_first if calls >= _CALLS_BEFORE_ETA and since_first > 0 else 0.0
+        rate = (done - at_first) / since_first if calls >= 3 and since_first > 0 else 0.0
         eta = f", ETA {(total - done) / rate:.0f} s" if rate > 0 and done < total else ""
         if told != f"{done} {latest}":
             tell(f"{title}: {done}/{total} in {elapsed:.0f} s{eta}" + (f"; {latest}" if latest else ""))
