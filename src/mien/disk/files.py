@@ -144,14 +144,20 @@ def write_json(path: Path, format_name: str, version: int, content: Mapping[str,
 
 
 def read_json(
-    path: Path, format_name: str, version: int, stage: str = _ANY_STAGE, remedy: str | None = None
+    path: Path,
+    format_name: str,
+    version: int,
+    stage: str = _ANY_STAGE,
+    remedy: str | None = None,
+    most: int = _MAX_JSON_BYTES,
 ) -> dict[str, Any]:
     """Read what `write_json` wrote; error messages name the command `stage` as the remedy.
 
-    `remedy` replaces that advice. A missing file still asks for its stage, if there is one.
+    `remedy` replaces that advice. A missing file still asks for its stage, if there is one. A larger file than `most`
+    bytes is refused.
     """
     try:
-        content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"))
+        content = parse_json(read_bytes(path, most).decode("utf-8"))
     except FileNotFoundError:
         asked = remedy if remedy and stage == _ANY_STAGE else f"run {stage} again"
         raise UserError(f"{path}: missing; {asked}") from None
