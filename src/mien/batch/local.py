@@ -11,13 +11,6 @@ from mien.batch.plan import Batch, Options, Row, Work
 from mien.batch.row import stop_attempts
 from mien.errors import UserError
 
-_ASSUMED_MB = 8000.0
-"""Free memory of systems that do not tell it."""
-_SHARE = 0.9
-"""Share of the available memory that rows may take."""
-_STOP_SECONDS = 0.5
-"""Seconds between two requests to stop. A row may start after the first one."""
-
 
 def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iterator[tuple[Row, Any]]:
     """Run the rows here, as many at once as jobs and memory allow (`mien.batch.drive` says what an engine does).
@@ -39,14 +32,14 @@ def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iter
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             running = [future for future in futures if not future.cancelled()]
-            while wait(running, _STOP_SECONDS).not_done:
+            while wait(running, 0.5).not_done:  # a row may start after the first request to stop
                 stop_attempts()
 
 
 def jobs_here(rows: Sequence[Row], options: Options) -> int:
     """How many rows run at once: as asked, or one for two threads; no more than fit the memory, if all are large."""
     largest = max((row.memory_mb for row in rows), default=1.0)
-    fitting = int(_SHARE * free_memory_mb() / max(largest, 1.0))
+    fitting = int(0.9 * free_memory_mb() / max(largest, 1.0))
     jobs = options.jobs or (os.cpu_count() or 1) // (options.threads or 2)
     return max(1, min(jobs, fitting, len(rows)))
 
@@ -57,4 +50,4 @@ def free_memory_mb() -> float:
         lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
         kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
         return int(kilobytes) / 1e3
-    return _ASSUMED_MB
+    return 8000.0  # where the system does not tell it

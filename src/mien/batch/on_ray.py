@@ -12,10 +12,6 @@ from typing import Any
 from mien.batch.plan import Batch, Options, Row, Work
 from mien.errors import UserError
 
-_LOST_NODES = 3
-"""How often Ray starts a row again whose node or worker was lost."""
-_WAITING = 200
-"""Rows that are handed to Ray at a time, if no number of jobs is given."""
 LOOK_SECONDS, PATIENCE_SECONDS = 30.0, 600.0
 """How often rows are looked for that fit no node, and how long a cluster may take to start a node for them."""
 _NO_NODE = (
@@ -43,14 +39,14 @@ def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iter
     waiting = list(reversed(rows))
     try:
         while waiting or running:
-            while waiting and len(running) < (options.jobs or _WAITING):
+            while waiting and len(running) < (options.jobs or 200):
                 row = waiting.pop()
                 asked = {
                     "num_cpus": options.threads or 2,
                     "num_gpus": options.gpus,
                     "memory": round(row.memory_mb * 1e6),
                 }
-                asked |= {"max_retries": _LOST_NODES, "name": f"mien {row.name}"}
+                asked |= {"max_retries": 3, "name": f"mien {row.name}"}
                 running[task.options(**asked).remote(work, row)] = row
             ended, _ = ray.wait(list(running), num_returns=1, timeout=LOOK_SECONDS)
             for first in ended:

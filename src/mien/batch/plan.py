@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from mien.disk.config import Range, decode
-from mien.disk.files import read_json, remove_leftovers, write_atomically, write_json
+from mien.disk.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
 from mien.disk.inside import check_unlinked, inside
 from mien.disk.locks import BeingWrittenError, hold
 from mien.errors import UserError
@@ -131,7 +131,9 @@ class Batch:
                 f"{self.root}: is not the folder of a batch (no plan.json); give the one that `mien batch TABLE --out` "
                 "names"
             )
-        return [decode(Row, row, f"{path}: row", _AGAIN) for row in read_json(path, *PLAN, remedy=_AGAIN)["rows"]]
+        content = read_json(path, *PLAN, remedy=_AGAIN, most=256 << 20)
+        with expect_whole(path, _AGAIN):
+            return [decode(Row, row, f"{path}: row", _AGAIN) for row in content["rows"]]
 
     def write_plan(self, rows: Sequence[Row]) -> None:
         """Write the rows."""

@@ -14,8 +14,6 @@ from mien.machine.terminal import counted, printable
 
 _STAGE = re.compile(r"stage (\d+) of (\d+) \(([\w -]+)\)")
 _PART = re.compile(r": (\d+)/(\d+) in ")
-_IN_LINE = 4
-"""Number of running rows that a line of progress names."""
 _SHOWN = 40
 """Number of rows of each kind that the text lists."""
 
@@ -45,8 +43,8 @@ def running_words(batch: Batch, rows: Sequence[Row]) -> str:
     """
     found = (_row(batch, row, batch.read_state(row.name)) for row in rows[:100])
     running = [row for row in found if row["status"] == "running"]
-    words = [f"{row['name']}: {row['stage'] or 'running'}{_percent(row)}" for row in running[:_IN_LINE]]
-    return printable("; ".join(words + ["..."] * (len(running) > _IN_LINE)))
+    words = [f"{row['name']}: {row['stage'] or 'running'}{_percent(row)}" for row in running[:4]]
+    return printable("; ".join(words + ["..."] * (len(running) > 4)))
 
 
 def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:

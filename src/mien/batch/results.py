@@ -60,10 +60,7 @@ def write_results(batch: Batch) -> list[dict[str, Any]]:
 
 def _cell(value: Any) -> Any:
     """A value of a csv. Texts that a spreadsheet would run as a formula begin with an apostrophe."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in _FORMULAS else value
-
-
-_FORMULAS = ("=", "+", "-", "@", "\t", "\r")
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
 def numbers(rows: Iterable[dict[str, Any]], column: str) -> list[float]:

@@ -36,9 +36,6 @@ PROGRAM = (sys.executable, "-m", "mien.commands.batch_row")
 """The command of a row's process."""
 EXIT_BUSY = 75
 """Exit code of a row's process if another process holds the row."""
-_PATIENCE_SECONDS, _STEP_SECONDS = 15.0, 0.5
-"""How long a row waits for its lock. The process that held it may be about to end, because its node was lost."""
-_TAIL_BYTES = 8192
 _waited_for: dict[subprocess.Popen[bytes], bool] = {}
 """Processes of rows that `attempt` waits for, in any thread of this process, and whether each was told to stop."""
 
@@ -60,7 +57,7 @@ def run_row(batch: Batch, row: Row, do: Do, patience: float = 0.0) -> State | No
         except BeingWrittenError:
             if time.monotonic() >= until:
                 return None
-            time.sleep(_STEP_SECONDS)
+            time.sleep(0.5)
 
 
 def _claimed(batch: Batch, row: Row, do: Do) -> State:
@@ -172,7 +169,7 @@ def tail(log: Path, since: int = 0) -> str:
     """The end of a log, without its first `since` bytes. Empty if it cannot be read."""
     try:
         with open_to_read(log) as file:
-            file.seek(max(since, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            file.seek(max(since, file.seek(0, os.SEEK_END) - 8192))
             return file.read().decode("utf-8", "replace")
     except (OSError, UserError):
         return ""
@@ -184,7 +181,7 @@ def row_process(root: Path, given: IO[str], do: Do) -> int:
     threading.Thread(target=_stop_at_end, args=(given,), daemon=True).start()
     try:
         with orderly_stops():
-            state = run_row(Batch(root), row, do, _PATIENCE_SECONDS)
+            state = run_row(Batch(root), row, do, 15.0)  # who held the row may be about to end: its node was lost
     except UserError as error:
         tell(f"mien: {error}")
         return 2

@@ -17,13 +17,10 @@ from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.machine.progress import say
 
-_MOST_TASKS = 1000
-"""Largest number of tasks of an array. Slurm's default limit is 1001."""
 POLL_SECONDS = 2.0
 """Seconds between two questions to Slurm."""
 _NOTED = "slurm/jobs.txt"
 """The file in the batch's folder that has the numbers of jobs which have not ended."""
-_DEFAULT_MINUTES, _SLACK, _LEAST_MINUTES = 24 * 60, 3.0, 10
 
 
 class _Task:
@@ -47,7 +44,7 @@ def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iter
     """Run the rows as job arrays, one for each class of memory (`mien.batch.drive` says what an engine does)."""
     noted = batch.root / _NOTED
     numbers, taken = list[str](), list[Row]()
-    size = math.ceil(len(rows) / _MOST_TASKS)
+    size = math.ceil(len(rows) / 1000)  # an array has at most 1001 tasks by default
     for alike in _by_memory(rows):
         try:
             numbers.append(_submit(work, alike, batch, options, size))
@@ -108,7 +105,7 @@ def _submit(work: Work, rows: Sequence[Row], batch: Batch, options: Options, siz
 def _minutes(batch: Batch) -> int:
     """The time limit of a row: three times the longest finished row, at first a day."""
     longest = max((state.seconds for state in batch.read_states().values() if state.runs), default=0.0)
-    return max(_LEAST_MINUTES, math.ceil(_SLACK * longest / 60)) if longest else _DEFAULT_MINUTES
+    return max(10, math.ceil(3.0 * longest / 60)) if longest else 24 * 60
 
 
 def _wait(noted: Path) -> None:

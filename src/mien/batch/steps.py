@@ -17,7 +17,6 @@ from mien.machine.progress import current_stage
 
 Main = Callable[[list[str]], int]
 """Runs a command of mien and returns its exit code."""
-_SAMPLE_SECONDS = 0.5
 _VIEWS, _SIDE = 12, 160
 """Number of pictures in a thumbnail, and their sides in pixels."""
 
@@ -52,7 +51,7 @@ def _do(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...],
 def _sample(step: str, stages: dict[str, float], ended: threading.Event) -> None:
     """Add up the seconds of each stage of a step while it runs."""
     before = time.monotonic()
-    while not ended.wait(_SAMPLE_SECONDS):
+    while not ended.wait(0.5):
         now = time.monotonic()
         stages[current_stage() or step] += now - before
         before = now

@@ -27,25 +27,15 @@ from mien.errors import CannotWriteError, UserError
 if TYPE_CHECKING:
     from torch import Tensor
 
-_KEPT_OF_NAME = 100
-"""Number of characters of a file's name that its temporary name keeps. File systems allow 255 bytes in all."""
-_UNREADABLE = (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RecursionError, AttributeError)
+_KEPT_OF_NAME = 100  # characters of a file's name that its temporary name keeps; file systems allow 255 bytes in all
+_UNREADABLE = (safetensors.SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError, AttributeError)
 """Errors of a damaged safetensors file. An AttributeError is a type of number that numpy lacks, such as float8."""
 _CHECKSUM = "checksum"
 """Key of the checksum, which covers everything else in a json file, or the header and data of a safetensors file."""
 _ANY_STAGE = "the stage that writes it"
-_AT_CURRENT_FOLDER, _EXCHANGE = -100, 2
-"""AT_FDCWD and RENAME_EXCHANGE of renameat2(2)."""
-_MAX_JSON_BYTES = 32 << 20
-"""Largest json file that is read, in bytes. The largest that mien writes has some megabytes. Empty lists take twenty
-times the size of their text in memory."""
-_MAX_HEADER_BYTES = 8 << 20
-"""Largest header of a safetensors file, in bytes. Headers that mien writes have some kilobytes."""
-_MAX_TENSORS_BYTES = 1 << 30
-"""Largest safetensors file that is read, in bytes. The largest that mien writes has some hundred megabytes."""
-_PIECE = 1 << 20
-"""Number of bytes that are hashed at a time."""
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_MAX_JSON_BYTES, _MAX_HEADER_BYTES, _MAX_TENSORS_BYTES = 32 << 20, 8 << 20, 1 << 30
+"""Largest json file, header of a safetensors file, and such file that are read. The largest that mien writes have some
+megabytes, some kilobytes, and some hundred megabytes."""
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
@@ -132,14 +122,15 @@ def _exchange(one: Path, other: Path) -> bool:
         rename = ctypes.CDLL(None).renameat2
     except (OSError, AttributeError, TypeError):  # TypeError: Windows
         return False
-    return rename(_AT_CURRENT_FOLDER, os.fsencode(one), _AT_CURRENT_FOLDER, os.fsencode(other), _EXCHANGE) == 0
+    at, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of renameat2(2)
+    return rename(at, os.fsencode(one), at, os.fsencode(other), exchange) == 0
 
 
 def cannot_write(path: Path, error: OSError) -> CannotWriteError:
     """The error for a failed write of `path`, with a remedy that fits the cause."""
     if isinstance(error, CannotWriteError):
         return error
-    full = error.errno in _FULL
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free disk space and run the same command again" if full else "choose another place"
     return CannotWriteError(f"{path}: cannot be written ({error.strerror or error}); {remedy}", error)
 
@@ -153,14 +144,20 @@ def write_json(path: Path, format_name: str, version: int, content: Mapping[str,
 
 
 def read_json(
-    path: Path, format_name: str, version: int, stage: str = _ANY_STAGE, remedy: str | None = None
+    path: Path,
+    format_name: str,
+    version: int,
+    stage: str = _ANY_STAGE,
+    remedy: str | None = None,
+    most: int = _MAX_JSON_BYTES,
 ) -> dict[str, Any]:
     """Read what `write_json` wrote; error messages name the command `stage` as the remedy.
 
-    `remedy` replaces that advice. A missing file still asks for its stage, if there is one.
+    `remedy` replaces that advice. A missing file still asks for its stage, if there is one. A larger file than `most`
+    bytes is refused.
     """
     try:
-        content = parse_json(read_bytes(path, _MAX_JSON_BYTES).decode("utf-8"))
+        content = parse_json(read_bytes(path, most).decode("utf-8"))
     except FileNotFoundError:
         asked = remedy if remedy and stage == _ANY_STAGE else f"run {stage} again"
         raise UserError(f"{path}: missing; {asked}") from None
@@ -223,13 +220,12 @@ def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
 
     No number is infinite. NaN means that a number is not known.
     """
-    return read_safetensors(path, lambda file: _finite(safetensors.numpy.load_file(file)), stage)
+    return read_safetensors(path, lambda file: _finite(safetensors.numpy.load_file(file), np.isinf), stage)
 
 
-def _finite(arrays: Mapping[str, Any]) -> Mapping[str, Any]:
+def _finite(arrays: Any, isinf: Callable[[Any], Any]) -> Any:
     for name, array in arrays.items():
-        numbers = np.asarray(array)
-        if numbers.dtype.kind == "f" and np.isinf(numbers).any():
+        if isinf(array).any():
             raise ValueError(f"{name!r} holds infinite numbers")
     return arrays
 
@@ -263,7 +259,7 @@ def _check_safetensors(path: Path) -> None:
         if not isinstance(header, dict) or not isinstance(metadata, dict):
             raise ValueError("its header or metadata is not an object")
         stored = metadata.get(_CHECKSUM)
-        if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, _PIECE), b"")):
+        if stored is not None and stored != _tensor_checksum(header, iter(partial(file.read, 1 << 20), b"")):
             raise ValueError("its content differs from what was written")
 
 
@@ -285,5 +281,6 @@ def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping
 def read_tensors(path: Path, stage: str = _ANY_STAGE, remedy: str | None = None) -> "dict[str, Tensor]":
     """Read safetensors as torch tensors on the CPU, as `read_arrays` does; error messages give `remedy`, or `stage`."""
     import safetensors.torch
+    import torch
 
-    return read_safetensors(path, lambda file: _finite(safetensors.torch.load_file(file)), stage, remedy)
+    return read_safetensors(path, lambda file: _finite(safetensors.torch.load_file(file), torch.isinf), stage, remedy)

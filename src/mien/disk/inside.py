@@ -15,7 +15,6 @@ from mien.disk.reading import NotOrdinaryError, open_handle
 from mien.errors import UserError
 from mien.machine.system import BINARY, NO_LINK
 
-_MAX_NAME_BYTES = 255
 _OF_SYSTEMS = frozenset({"thumbs.db", "desktop.ini", "__macosx"})
 _NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
 """Unicode categories: control characters, halves of surrogate pairs, line and paragraph separators."""
@@ -33,7 +32,7 @@ def is_plain_name(name: object) -> bool:
     """Whether it is a name that a file or folder can have, and that does not lead to another folder."""
     if not (isinstance(name, str) and is_one_line(name)):
         return False
-    return name not in ("", ".", "..") and not set(name) & {"/", "\\"} and len(name.encode()) <= _MAX_NAME_BYTES
+    return name not in ("", ".", "..") and not set(name) & {"/", "\\"} and len(name.encode()) <= 255
 
 
 def inside(folder: Path, name: object) -> Path:

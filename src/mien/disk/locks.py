@@ -43,24 +43,15 @@ Result = TypeVar("Result")
 
 WAIT, AGAIN = "wait until it is done, or end it", "try again when it is done"
 """Remedies for writers and for readers."""
-_MAX_NAME_BYTES = 240
-"""Longest name of a lock file, in bytes. File systems allow 255."""
-_NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
-_REMOVED = frozenset({errno.ENOENT, errno.ESTALE})
-"""Errors if the process that released the lock has removed the file and the folders that stayed empty (ESTALE: on
-another machine)."""
 PATIENCE_SECONDS, _STEP_SECONDS = 0.5, 0.01
 """Seconds to try again for a lock without a readable holder, and between two tries.
 
 The holder may be a reader that checks the lock for a
 moment, a process that was killed and is about to end, or a process that is about to sign."""
 _NAMELESS = "which has not left its name"
-_PAUSES_SECONDS = (0.0, 0.02, 0.05, 0.1)
-"""Pauses before a reader reads again files that a writer changed in the meantime."""
 
 _BEGINNING = b'{"format": "mien.lock"'
 """First bytes of every lock file of mien."""
-_MAX_SIGNATURE_BYTES = 4096
 
 _ours: dict[tuple[int, int], int] = {}
 """Device and number of each lock file that is held -> the process that holds it. A child made by fork has a copy."""
@@ -107,7 +98,7 @@ def read_beside_writers(read: Callable[[], Result], folders: Sequence[Path], pla
     It reads these folders, whose writers lock these places. If one of them holds a lock when it fails for the last
     time, a BeingWrittenError says so.
     """
-    for pause in (*_PAUSES_SECONDS, None):
+    for pause in (0.0, 0.02, 0.05, 0.1, None):  # before it reads again what a writer changed in the meantime
         before = [_state(folder) for folder in folders]
         try:
             return read()
@@ -127,7 +118,7 @@ def lock_file(place: Path) -> Path:
     """The path of a place's lock file, a hidden file beside the place."""
     place = Path(os.path.abspath(place))  # noqa: PTH100 (`resolve` would follow a link in the place of a folder)
     name = f".{place.name}.lock"
-    if len(os.fsencode(name)) > _MAX_NAME_BYTES:
+    if len(os.fsencode(name)) > 240:  # file systems allow 255 bytes
         name = f".{hashlib.sha256(os.fsencode(place.name)).hexdigest()[:32]}.lock"
     return place.with_name(name)
 
@@ -161,12 +152,13 @@ def _acquire(place: Path, file: Path, remedy: str) -> Callable[[], None]:
             if holder not in (None, _NAMELESS) or time.monotonic() >= patience:
                 raise _being_written(place, holder or _NAMELESS, remedy) from None
         except OSError as error:
-            if error.errno in _NO_LOCKS:
+            if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS):
                 if "no locks" not in said_once:
                     said_once.add("no locks")
                     say(f"warning: {file.parent}: its file system has no locks; run only one command at a time there")
                 return lambda: None
-            if error.errno not in _REMOVED or time.monotonic() >= patience:
+            # The process that released the lock may have removed the file and its empty folders (ESTALE: elsewhere).
+            if error.errno not in (errno.ENOENT, errno.ESTALE) or time.monotonic() >= patience:
                 raise
         time.sleep(_STEP_SECONDS)
 
@@ -292,7 +284,7 @@ def _read_holder(handle: int) -> str | None:
     The result is None if the file names no process, or one that has ended: the holder has not signed yet.
     """
     try:
-        about = parse_json(read_at(handle, _MAX_SIGNATURE_BYTES, SIGNATURE_AT).decode())
+        about = parse_json(read_at(handle, 4096, SIGNATURE_AT).decode())
         pid, host, since, command = (about[name] for name in ("pid", "host", "since", "command"))
         if not 0 < pid < 1 << 31 or (host == socket.gethostname()[:60] and not may_live(pid)):
             return None

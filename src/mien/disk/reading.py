@@ -23,25 +23,11 @@ from mien.machine.system import BINARY, NO_LINK, NO_WAIT
 
 MAX_SIDE = 8192
 """Largest width or height of a picture in pixels, of those that are read and of those that are rendered."""
-_WHOLE_NUMBERS = range(-(1 << 63), 1 << 64)
-_MAX_DIGITS = 20
-"""Most characters of a whole number, with its sign. Python takes long to parse very many digits, and float() and numpy
-refuse numbers that do not fit."""
-_MAX_DEPTH = 50
-"""Most levels of nested lists and objects. Python has a limit of its own, but reaches it only later, when the content
-is shown or compared."""
 _MAX_SHOWN = 40
 """Most characters of a name or number that a message shows."""
 _COSTS = {"[": 64, "{": 232, ",": 40}
 """Bytes that Python takes for a list, an object, and a further entry with its number or text, about."""
-_MAX_PARSED_BYTES = 1 << 30
-"""Most memory that the content of a json text may take, in bytes. Empty lists take twenty times their text."""
-_ARCHIVE_END, _ARCHIVE_END_SIZE = b"PK\x05\x06", 22
-_END_OF_LARGE_ARCHIVE = b"PK\x06\x07"
-"""Marker of archives with more than 65,534 members, or of 4 GB and more."""
-_MAX_COMMENT_BYTES = 65535
-_MAX_DIRECTORY_BYTES = 1 << 20
-"""Largest list of members at the end of an archive, in bytes. Each member takes about 50."""
+_ARCHIVE_END_SIZE, _MAX_COMMENT_BYTES = 22, 65535
 _STUMBLES = (
     LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError, EOFError,
     struct.error,
@@ -72,7 +58,7 @@ def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False,
         any_size: whether numbers of any size are allowed, because the caller checks them and can name their place.
         constants: whether NaN and infinity are allowed, for the same reason.
     """
-    if sum(cost * text.count(sign) for sign, cost in _COSTS.items()) > _MAX_PARSED_BYTES:
+    if sum(cost * text.count(sign) for sign, cost in _COSTS.items()) > 1 << 30:  # empty lists take 20 times their text
         raise ValueError("it holds too many lists, objects or numbers")
     hooks: dict[str, Any] = {} if any_size else {"parse_int": _whole_number, "parse_float": _finite_number}
     if not constants:
@@ -84,7 +70,7 @@ def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False,
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
     level = [content]
-    for _ in range(_MAX_DEPTH):
+    for _ in range(50):  # Python's own limit is reached only later, when the content is shown or compared
         level = [child for node in level for child in _children(node)]
         if not level:
             return content
@@ -114,8 +100,8 @@ def _object_of_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _whole_number(digits: str) -> int:
-    number = int(digits) if len(digits) <= _MAX_DIGITS else None
-    if number is None or number not in _WHOLE_NUMBERS:
+    # Python takes long to parse very many digits, and float() and numpy refuse numbers that do not fit.
+    if len(digits) > 20 or not -(1 << 63) <= (number := int(digits)) < 1 << 64:
         raise ValueError(f"it holds a number of {len(digits.lstrip('-'))} digits")
     return number
 
@@ -147,11 +133,12 @@ def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - _MAX_COMMENT_BYTES - _ARCHIVE_END_SIZE))
     tail = file.read()
-    place = tail.rfind(_ARCHIVE_END)
+    place = tail.rfind(b"PK\x05\x06")
     if place < 0 or len(tail) < place + _ARCHIVE_END_SIZE:
         raise ValueError("its end is missing: copy it again")
     directory = int.from_bytes(tail[place + 12 : place + 16], "little")
-    if directory > _MAX_DIRECTORY_BYTES or tail[max(0, place - 20) : place].startswith(_END_OF_LARGE_ARCHIVE):
+    # Each member takes about 50 bytes. The mark is that of archives of 4 GB, or with more than 65,534 members.
+    if directory > 1 << 20 or tail[max(0, place - 20) : place].startswith(b"PK\x06\x07"):
         raise ValueError("it has far more members than such a file")
     return zipfile.ZipFile(file)
 

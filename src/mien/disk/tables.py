@@ -6,8 +6,6 @@ import json
 from collections.abc import Iterator
 from typing import IO
 
-_MAX_HEADING = 65_536
-"""Largest number of characters of the first line that decide what separates the columns."""
 _MAX_LINE = 1 << 20
 """Most characters of a line."""
 _CELL_BYTES, _SHORT_CELL_BYTES, MAX_CELLS_BYTES = 72, 8, 5 << 28
@@ -48,7 +46,7 @@ def split_lines(file: IO[bytes] | io.BytesIO, most: int = _MAX_LINE) -> Iterator
     file.seek(0)
     try:
         with io.TextIOWrapper(file, encoding=encoding, newline="") as text:
-            lines = iter(lambda: text.readline(_MAX_HEADING), "")
+            lines = iter(lambda: text.readline(1 << 16), "")
             heading = next((line for line in lines if line.strip() and not _is_hint(line)), "")
             text.seek(0)
             reader = csv.reader(_short_lines(text, most), delimiter=max(",;\t", key=heading.count))

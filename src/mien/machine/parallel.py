@@ -11,8 +11,6 @@ from mien.machine.threads import thread_count
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_AHEAD = 2
-"""Number of finished results that may wait, in addition to one for each thread."""
 
 
 def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -42,7 +40,7 @@ def stream_in_threads(
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
-                if len(waiting) > threads + _AHEAD:
+                if len(waiting) > threads + 2:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -94,7 +94,7 @@ def _plain_progress(title: str, total: int, completed: int) -> Iterator[Advance]
         nonlocal told
         elapsed, since_first = time.monotonic() - start, time.monotonic() - first
         # The first item takes longer, because it also loads and warms up what the others use.
-        rate = (done - at_first) / since_first if calls >= _CALLS_BEFORE_ETA and since_first > 0 else 0.0
+        rate = (done - at_first) / since_first if calls >= 3 and since_first > 0 else 0.0
         eta = f", ETA {(total - done) / rate:.0f} s" if rate > 0 and done < total else ""
         if told != f"{done} {latest}":
             tell(f"{title}: {done}/{total} in {elapsed:.0f} s{eta}" + (f"; {latest}" if latest else ""))

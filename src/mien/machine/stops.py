@@ -34,8 +34,6 @@ _KINDS: dict[int, type[BaseException]] = {
     signal.SIGTERM: Terminated,
     **dict.fromkeys(HANGUPS, HungUp),
 }
-_REPEAT_SECONDS = 0.05
-"""Time after which a stop that a library has dropped is repeated."""
 DEAF_SECONDS = 10.0
 """Time after a stop in which signals are ignored. Later ones count, since a library may have swallowed the first."""
 
@@ -83,7 +81,7 @@ def orderly_stops() -> Iterator[None]:
             hook(dropped)
             return
         asked.clear()
-        again = threading.Timer(_REPEAT_SECONDS, repeat_signal, [threading.get_ident(), number])
+        again = threading.Timer(0.05, repeat_signal, [threading.get_ident(), number])
         again.daemon = True
         again.start()
 

@@ -24,7 +24,6 @@ HANGUPS: tuple[int, ...] = (signal.SIGBREAK,) if sys.platform == "win32" else (s
 SIGNATURE_AT = 1 if IS_WINDOWS else 0
 """Offset of the text in a lock file. A lock of Windows is of the first byte, which then nobody else can read."""
 
-_LOOKS, _LOOK_SECONDS = 5, 0.01
 PARENT_VARIABLE = "MIEN_VIEWER_OF"
 """Environment variable of a viewer with the process whose end also ends it."""
 _MIB = 1 << 20
@@ -36,11 +35,11 @@ def is_locked(handle: int) -> bool:
         # Windows has no shared lock of this kind here, so two that look at the same time meet: look again.
         from filelock import lock_descriptor, unlock_descriptor
 
-        for _ in range(_LOOKS):
+        for _ in range(5):
             if lock_descriptor(handle, blocking=False):
                 unlock_descriptor(handle)
                 return False
-            time.sleep(_LOOK_SECONDS)
+            time.sleep(0.01)
         return True
     import fcntl
 

@@ -13,10 +13,6 @@ from mien.errors import UserError
 _HIDDEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 """Unicode categories: control characters, format characters such as the reversal of text, halves of surrogate pairs,
 line and paragraph separators."""
-_JOINERS = frozenset("\u200c\u200d")
-"""Format characters that belong to words and emoji."""
-_FIRST_BYTE, _LAST_BYTE = "\udc80", "\udcff"
-"""Characters that Python uses for bytes in file names that are not UTF-8."""
 
 
 def printable(text: str, *, lines: bool = False) -> str:
@@ -89,12 +85,12 @@ def drop_output() -> None:
 
 
 def _acts(character: str, lines: bool) -> bool:
-    if character in _JOINERS or (lines and character == "\n"):
+    if character in "\u200c\u200d" or (lines and character == "\n"):  # two joiners belong to words and emoji
         return False
     return unicodedata.category(character) in _HIDDEN
 
 
 def _seen(character: str) -> str:
-    if _FIRST_BYTE <= character <= _LAST_BYTE:
+    if "\udc80" <= character <= "\udcff":  # a byte of a file name that is not UTF-8
         return f"\\x{ord(character) - 0xDC00:02x}"
     return character.encode("unicode_escape").decode("ascii")

@@ -37,8 +37,6 @@ _STRANGE_HOST = (
     "This viewer runs without a token, so it answers only as localhost, and the request's Host is {host}. Open the "
     "address that mien printed. Behind a proxy, start mien without --no-token.\n"
 )
-_MOST_SHOWN = 100
-"""Number of characters of a header that an answer repeats."""
 
 
 def is_loopback(host: str) -> bool:
@@ -140,7 +138,7 @@ def _name_of(host: str) -> str:
 
 def _shown(header: str) -> str:
     """A header as an answer repeats it."""
-    return printable(header[:_MOST_SHOWN]) or "missing"
+    return printable(header[:100]) or "missing"
 
 
 def _same(given: str, token: str) -> bool:

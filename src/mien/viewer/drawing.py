@@ -21,13 +21,8 @@ if TYPE_CHECKING:
 Surface = Literal["avatar", "mesh", "confidence"]
 """What is drawn: the Gaussians, the grey mesh of the face model, or the mesh in the colours of its confidence."""
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "grey": (0.5, 0.5, 0.5), "black": (0.0, 0.0, 0.0)}
-_LINE = np.array([40, 90, 220], np.float32)
-_LINE_SHARE = 0.6
-"""Colour of the wireframe, and its share in a pixel that it covers."""
 _FILLED_IN, _SEEN = (0.93, 0.45, 0.30), (0.25, 0.55, 0.80)
 """Colours of the mesh where nothing was filmed, and where everything was: those of the report."""
-_CORNER, _MARGIN = 0.25, 0.02
-"""Height of the camera's picture in a corner, and its distance from the edges, as shares of the picture's height."""
 MIN_SIDE, MAX_SIDE = 16, 2048
 """Smallest and largest side of a picture, in pixels."""
 
@@ -135,7 +130,8 @@ def _with_edges(picture: UInt8[np.ndarray, "h w 3"], index: Int32[np.ndarray, "h
     edge[:, 1:] |= index[:, 1:] != index[:, :-1]
     edge[1:] |= index[1:] != index[:-1]
     lined = picture.copy()
-    lined[edge] = (_LINE_SHARE * _LINE + (1 - _LINE_SHARE) * picture[edge]).astype(np.uint8)
+    line = np.array([40, 90, 220], np.float32)
+    lined[edge] = (0.6 * line + (1 - 0.6) * picture[edge]).astype(np.uint8)
     return lined
 
 
@@ -177,10 +173,10 @@ def in_corner(seen: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"
     import cv2
 
     height, width = shown.shape[:2]
-    scale = min(_CORNER * height / seen.shape[0], _CORNER * width / seen.shape[1])
+    scale = min(0.25 * height / seen.shape[0], 0.25 * width / seen.shape[1])
     wide, high = (max(1, round(scale * side)) for side in (seen.shape[1], seen.shape[0]))
     small = cv2.resize(seen, (wide, high), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    bottom, left = height - round(_MARGIN * height), min(round(_MARGIN * height), width - wide)
+    bottom, left = height - round(0.02 * height), min(round(0.02 * height), width - wide)
     picture = shown.copy()
     picture[bottom - high : bottom, left : left + wide] = small
     return picture

@@ -15,10 +15,6 @@ GROUPS = (
 )
 """Titles of groups, and how the names of their expressions begin. Other expressions are in the group `OTHER`."""
 OTHER = "Other"
-RANDOM_EXPRESSIONS = 6
-"""Number of expressions in a random face. Those of a left and a right side count once."""
-_MOST = 0.7
-"""Largest coefficient of a random face, as a share of the expression's range."""
 _SIDE = re.compile(r"(Left|Right)$")
 _AWAY = re.compile(r"(jaw|mouth)(Left|Right)$")
 """Moves to one side or to the other, of which both together are none."""
@@ -67,10 +63,10 @@ def random_expression(
         if bounds[index, 0] < bounds[index, 1] and not _CLOSED.match(name):
             kinds.setdefault(_SIDE.sub("", name), []).append(index)
     expression = rest.copy()
-    chosen = random.permutation(len(kinds))[:RANDOM_EXPRESSIONS]
+    chosen = random.permutation(len(kinds))[:6]
     members = list(kinds.values())
     for kind in chosen:
-        share = random.uniform(0, _MOST)
+        share = random.uniform(0, 0.7)
         both: list[int] = members[int(kind)]
         for index in both if len(both) < 2 or not _AWAY.fullmatch(names[both[0]]) else random.permutation(both)[:1]:
             # Expressions of FLAME go in both directions, those of ARKit from 0 to 1.

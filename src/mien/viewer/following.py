@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from mien.media.live_camera import LiveCamera, LiveFrame
 
 STAGES = ("camera", "tracking", "drawing")
-_PATIENCE_SECONDS = 0.04
-"""Time without a frame after which the avatar goes on to rest, in seconds."""
 _WORDS = {
     "waiting": "Nobody is seen. Look into the camera.",
     "learning": "Look ahead for a second, with a relaxed face.",
@@ -173,7 +171,7 @@ class CameraSwitch:
     def _follow(self, camera: "LiveCamera", follower: "Follower", detector: "LandmarkDetector") -> None:
         number, frames, last = -1, 0, None
         while not self._stopping.is_set():
-            frame = camera.newest(number, _PATIENCE_SECONDS)
+            frame = camera.newest(number, 0.04)  # then the avatar goes on to rest
             if frame is None:
                 if camera.ended:
                     return

@@ -16,10 +16,6 @@ STILL_SECONDS = 0.25
 QUICK_SECONDS, SLOW_SECONDS = 0.02, 0.04
 """Times of a full picture in seconds: from below the first on, pictures have full size while something moves, too, and
 from above the second on, half size again. Two times keep the size from changing back and forth."""
-_OF_A_HALF = 4.0
-"""Time of a full picture, if it is not known, as a multiple of that of half size: it has four times the pixels."""
-_LAST = 0.5
-"""Weight of the last picture in the mean of these times."""
 _NEVER = float("-inf")
 
 
@@ -122,7 +118,7 @@ class DrawingLoop:
         picture = self._draw(view, full)
         ended = self._clock()
         with self._changed:
-            self._time((ended - began) * (1.0 if full else _OF_A_HALF))
+            self._time((ended - began) * (1.0 if full else 4.0))  # it has four times the pixels
             client.drawn, client.is_full, client.served_at = wanted, full, ended
             self.pictures += 1
             there = self._clients.get(key) is client
@@ -147,7 +143,7 @@ class DrawingLoop:
     def _time(self, seconds: float) -> None:
         """Take account of the time that a full picture took, or would have taken."""
         before = seconds if self._full_seconds is None else self._full_seconds
-        self._full_seconds = _LAST * seconds + (1 - _LAST) * before
+        self._full_seconds = 0.5 * seconds + 0.5 * before
         if self._full_seconds < QUICK_SECONDS:
             self._is_quick = True
         elif self._full_seconds > SLOW_SECONDS:

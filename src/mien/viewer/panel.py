@@ -22,13 +22,7 @@ from mien.viewer.work import Worker
 MAX_ANGLE = 0.5
 """Largest angle of a joint's slider, in radians."""
 _STEP = 0.01
-_AXES = ("nod", "turn", "tilt")
 _NOTHING, _LOADING = "none", "Loading ..."
-_LEAST_HEIGHT, _MOST_HEIGHT = 128, 1080
-_MOST_STILLS = 8
-"""Number of browsers whose screenshots may wait."""
-_FOLLOW_SECONDS = 0.25
-"""Time between two moves of the sliders while a motion plays, in seconds."""
 
 
 class Panel:
@@ -63,7 +57,7 @@ class Panel:
         self._play_asked = self._loading = False
         """Whether Play was pressed before a motion was there, and whether one is being loaded."""
         self.preset: viser.GuiDropdownHandle[str] | None = None
-        self._stills = Worker("mien-stills", failed, _MOST_STILLS)
+        self._stills = Worker("mien-stills", failed, most=8)
         self._videos = Worker("mien-videos", failed, most=0)
         self._motions, self._switching = Worker("mien-motions", failed), Worker("mien-camera", failed)
         about = session.avatar.portable.about
@@ -90,7 +84,7 @@ class Panel:
         """Move the sliders to the face that is shown, now and then while a motion plays or a camera is followed."""
         now = time.monotonic()
         moves = self._session.playing or (self._camera is not None and self._camera.is_on)
-        if moves and now - self._followed_at < _FOLLOW_SECONDS:
+        if moves and now - self._followed_at < 0.25:
             return
         self._followed_at = now
         self._name_play()
@@ -273,7 +267,7 @@ class Panel:
         with gui.add_folder("Joints", expand_by_default=False):
             for name, angles in zip(avatar.joint_names, avatar.portable.neutral.joints.tolist(), strict=True):
                 for axis, angle in enumerate(angles):
-                    label = f"{readable(name)} {_AXES[axis]}"
+                    label = f"{readable(name)} {('nod', 'turn', 'tilt')[axis]}"
                     turn = partial(self._session.set_joint, name, axis)
                     self._add_slider(f"{name}_{'xyz'[axis]}", label, -MAX_ANGLE, MAX_ANGLE, angle, turn)
 
@@ -300,7 +294,7 @@ class Panel:
             surface = gui.add_dropdown("Show", tuple(surfaces)) if len(surfaces) > 1 else None
             wireframe = gui.add_checkbox("Wireframe", False) if session.mesh is not None else None
             background = gui.add_dropdown("Background", tuple(BACKGROUNDS))
-            height = gui.add_slider("Height in pixels", _LEAST_HEIGHT, _MOST_HEIGHT, 8, session.height)
+            height = gui.add_slider("Height in pixels", 128, 1080, 8, session.height)
             filmed = gui.add_button("Camera as filmed")
         for handle, name in ((surface, "surface"), (wireframe, "wireframe"), (background, "background")):
             if handle is not None:

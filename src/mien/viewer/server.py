@@ -31,16 +31,6 @@ from mien.viewer.page import adapted
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, center_of
 
-_MOVING_QUALITY, _STILL_QUALITY = 75, 92
-"""JPEG qualities of pictures of half size and of full size, 1 to 100."""
-_MOST_TOLD = 10
-"""Number of failures that are told; a browser could cause them again and again."""
-_MOST_BYTES = 1 << 16
-"""Largest message of a browser, in bytes. A browser that sends a larger one is disconnected."""
-_CLOSE_SECONDS = 1.0
-"""Time that a browser has to answer when its connection is closed, in seconds."""
-_WATCH_SECONDS = 0.5
-
 
 def serve(
     session: Session,
@@ -108,7 +98,7 @@ class Serving:
     def wait(self) -> None:
         """Wait until the camera ends, or the loop fails, which is a bug. Ctrl-C and SIGTERM end the wait, too."""
         while self.loop.running and not (self._camera is not None and self._camera.ended):
-            self.loop.wait(_WATCH_SECONDS)
+            self.loop.wait(0.5)
         if self.loop.error is not None:
             raise self.loop.error
 
@@ -146,7 +136,7 @@ class Serving:
         missing = missing_package(error, "view") if isinstance(error, ImportError) else None
         words = missing or f"a browser's request failed, and the viewer goes on ({type(error).__name__}: {error})"
         with self._failing:
-            if words in self.failures or len(self.failures) >= _MOST_TOLD:
+            if words in self.failures or len(self.failures) >= 10:  # a browser could cause them again and again
                 return
             self.failures.append(words)
         tell(f"mien: {words}")
@@ -163,8 +153,7 @@ class Serving:
         first, moved = view_of(client.camera), False
 
         def show(picture: Any, full: bool) -> None:
-            quality = _STILL_QUALITY if full else _MOVING_QUALITY
-            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=92 if full else 75)
             seen = self.session.taken()
             if seen is not None and self._camera is not None:
                 self._camera.shown(seen)
@@ -262,7 +251,7 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
                 response.headers.update(HEADERS)
             return response
 
-        named |= {"max_size": _MOST_BYTES, "close_timeout": _CLOSE_SECONDS}
+        named |= {"max_size": 1 << 16, "close_timeout": 1.0}  # bytes of a message; seconds for a browser's answer
         return start(handler, sock=listener, process_request=process, **named)
 
     module.serve = guarded

@@ -35,8 +35,6 @@ from mien.viewer.faces import random_expression
 
 DEFAULT_HEIGHT = 512
 """Largest height of a picture in pixels, at first."""
-_IN_BOX = (0.02, 0.98)
-"""Shares of the Gaussians between which the box of the head is, along each axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +298,7 @@ def _check_look(changes: Mapping[str, Any]) -> None:
 def center_of(avatar: runtime.Avatar) -> Float32[np.ndarray, " 3"]:
     """The middle of the avatar at rest in world space, in metres: of the box that holds nearly all of its Gaussians."""
     posed = avatar.pose()
-    box = np.quantile(posed.means, _IN_BOX, axis=0)
+    box = np.quantile(posed.means, (0.02, 0.98), axis=0)
     middle = box.mean(0)
     if posed.T_world_local is not None:
         middle = posed.T_world_local[:3, :3] @ middle + posed.T_world_local[:3, 3]

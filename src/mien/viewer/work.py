@@ -6,9 +6,6 @@ viser would run such work in a queue without a bound, which the process has to e
 import threading
 from collections.abc import Callable, Hashable
 
-_PATIENCE_SECONDS = 2.0
-"""Time that `stop` gives to work that runs, in seconds."""
-
 
 class Worker:
     """Does one thing at a time, in a thread that does not keep the process from ending."""
@@ -41,7 +38,7 @@ class Worker:
             self._waiting.clear()
             self._changed.notify()
         if self._thread is not None:
-            self._thread.join(_PATIENCE_SECONDS)
+            self._thread.join(2.0)
 
     def _run(self) -> None:
         while True:
