@@ -55,7 +55,7 @@ def gnm_like(anny: FaceModel) -> dict[str, Any]:
         "joint_identity_basis": basis[:, [1, 1, 3, 4]].astype(np.float32),
         "joint_names": np.array(_ORDER), "joint_parent_indices": parents,
         "skinning_weights": weights.astype(np.float32),
-        "pose_correctives_regressor": _correctives(anny)[:, :, order].reshape(36, -1).astype(np.float32),
+        "pose_correctives_regressor": np.zeros((36, template.size), np.float32),
         "vertex_groups": np.stack(list(groups.values())).astype(np.float32),
         "vertex_group_names": np.array(list(groups)),
     }  # fmt: skip
@@ -80,8 +80,6 @@ def posed_as_gnm(
     bind = bind + np.tensordot(expression, arrays["expression_basis"].astype(np.float64), 1)
     joints = arrays["template_joint_positions"] + np.tensordot(identity, arrays["joint_identity_basis"], 1)
     turns = matrix_from_axis_angle(torch.from_numpy(rotations)).numpy()
-    regressor = arrays["pose_correctives_regressor"].astype(np.float64)
-    bind = bind + ((turns - np.eye(3)).ravel() @ regressor).reshape(-1, 3)
     world: list[tuple[np.ndarray, np.ndarray]] = []
     for joint, parent in enumerate(arrays["joint_parent_indices"]):
         if parent < 0:
@@ -101,15 +99,6 @@ def _order(anny: FaceModel) -> tuple[np.ndarray, np.ndarray]:
     new_index = np.empty(len(order), np.int64)
     new_index[order] = np.arange(len(order))
     return order, new_index[anny.faces.numpy()]
-
-
-def _correctives(anny: FaceModel) -> np.ndarray:
-    """The lids follow the eyes, and the head joint's turn twists the neck a little. The root has none."""
-    correctives = np.zeros((4, 9, len(anny.template), 3))
-    correctives[2:] = anny.pose_basis.double().numpy().reshape(3, 9, -1, 3)[1:]  # type: ignore[union-attr]
-    weights = anny.skinning_weights.double().numpy()
-    correctives[1, 2] = 0.01 * weights[:, :1] * weights[:, 1:2] * np.array([1.0, 0.3, 0.2])
-    return correctives
 
 
 def _expressions(anny: FaceModel) -> np.ndarray:

@@ -18,7 +18,6 @@ from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.tracking.tracking import Tracking
 from mien.training import read_sequence, train
-from plain_settings import plain_config, plain_run
 from toy_scene import toy_sequence
 
 MadeOnce = Callable[[str, Callable[[Path], object]], Path]
@@ -56,14 +55,3 @@ def toy_workspace(made_once: MadeOnce) -> Path:
 def evaluated_workspace(made_once: MadeOnce) -> Path:
     """Return the same with the figures of its run."""
     return made_once("evaluated_workspace", write_evaluated_workspace)
-
-
-def toy_run(made_once: MadeOnce, method: str) -> Path:
-    """Return the folder of a run of twelve steps by a method's plain settings, without held-out frames."""
-
-    def make(folder: Path) -> None:
-        face_model, sequence = toy_sequence(timesteps=5, size=32)
-        settings = plain_run(steps=12, split="none", checkpoint_every=100, record_every=4)
-        train([sequence], face_model, plain_config(method), settings, folder)
-
-    return made_once(f"toy_run_{method}", make)

@@ -25,7 +25,8 @@ from mien.evaluation.text import protocol_lines
 from mien.media.video import write_video
 from mien.tracking.scoring import Scoring
 from plain_settings import plain_config, plain_run
-from refusals import refuses
+from refusals import complaint, refuses
+from shared_things import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
 PLAIN = ScoreSettings(perceptual=False)
@@ -145,9 +146,15 @@ def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFi
     for wrong in (
         ["evaluate"], ["evaluate", "--images", str(folders.images)], [*given, "--compare"],
         ["evaluate", "--images", str(tmp_path / "none"), "--truth", str(folders.truth)],
-        ["evaluate", str(tmp_path), str(tmp_path)],
+        ["evaluate", str(tmp_path), str(tmp_path)], [*given, "--fit-faces"],
     ):  # fmt: skip
         assert main(wrong) == 2
+    write_toy_workspace(tmp_path / "W")
+    for more, told in (
+        (["--fit-faces", "--fit-steps", "0"], "--fit-steps 0: give a number from 1 to 10000"),
+        (["--fit-faces", "--compare"], "--fit-faces: is for one run"),
+    ):
+        assert told in complaint(capsys, "evaluate", str(tmp_path / "W"), *more)
 
 
 QUICK = EvaluationSettings(perceptual=False, video_frames=0, baselines=False, threads=1)

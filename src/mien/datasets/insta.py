@@ -205,13 +205,12 @@ def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
         yield from _read_pictures(path)
         return
     model = needed_flame(path, face_model, VERSION)
-    found = read_tracker_frames(checkpoints, model)
-    if found.blinks:
-        say(f"{layout.name}: lids are closed in {found.blinks:.0%} of the frames, which FLAME's parameters do not show")
+    face, (K, seen), blinks = read_tracker_frames(checkpoints, model)
+    if blinks:
+        say(f"{layout.name}: lids are closed in {blinks:.0%} of the frames, which FLAME's parameters do not show")
     size = picture_size(layout.frames[0].picture)
-    camera = {"0": camera_of(scaled_to_pictures(path, found.camera.K, found.camera.size, size), FRONT, size)}
-    tracked = model, found.face
-    sequence = sequence_of(path, layout.name, _pictures(layout), camera, _FPS, tracked, VERSION)
+    camera = {"0": camera_of(scaled_to_pictures(path, K, seen, size), FRONT, size)}
+    sequence = sequence_of(path, layout.name, _pictures(layout), camera, _FPS, (model, face), VERSION)
     yield replace(sequence, own_split=_own_split(layout))
 
 
@@ -237,8 +236,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     if file.exists():
         K, tracked, poses = _transforms(file)
     elif _checkpoints(layout):
-        found = read_tracker_camera(_checkpoints(layout))
-        K, tracked = found.K, found.size
+        K, tracked = read_tracker_camera(_checkpoints(layout))
     else:
         raise UserError(f"{file}: is missing, and there are no checkpoints, so the camera is not known; {REMEDY}")
     camera = {"0": camera_of(scaled_to_pictures(path, K, tracked, size), FRONT, size)}

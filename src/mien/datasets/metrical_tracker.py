@@ -6,7 +6,6 @@ MPI may give away, and mien's FLAME has no place for them, so they are only coun
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,26 +34,9 @@ _CLOSED = 0.3  # number of an eyelid above which a blink counts
 _MAX_CHANGE = 0.005  # largest relative change of a focal length in a sequence. The tracker keeps it constant
 
 
-@dataclass(frozen=True, eq=False)
-class TrackerCamera:
-    """The one camera of a sequence."""
-
-    K: Float[np.ndarray, "3 3"]
-    """The median intrinsics, in pixels."""
-    size: tuple[int, int] | None
-    """Width and height of the pictures that were tracked. None if the checkpoints do not tell."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrackerFrames:
-    """The checkpoints of one sequence, t of them."""
-
-    face: FaceParams
-    """The faces, seen by a camera with the matrix `flame_poses.FRONT`."""
-    camera: TrackerCamera
-    """The camera."""
-    blinks: float
-    """Share of frames in which a lid is closed, which the face does not show."""
+TrackerCamera = tuple[Float[np.ndarray, "3 3"], tuple[int, int] | None]
+"""The median intrinsics of a sequence's camera in pixels, and width and height of the pictures that were tracked. None
+if the checkpoints do not tell."""
 
 
 def read_tracker_camera(paths: Sequence[Path]) -> TrackerCamera:
@@ -62,8 +44,12 @@ def read_tracker_camera(paths: Sequence[Path]) -> TrackerCamera:
     return _camera(paths[0].parent, _read_arrays(paths))
 
 
-def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> TrackerFrames:
-    """Read the checkpoints of a sequence, in order."""
+def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> tuple[FaceParams, TrackerCamera, float]:
+    """Read the checkpoints of a sequence, in order.
+
+    Returns the faces, seen by a camera with the matrix `flame_poses.FRONT`, its camera, and the share of frames in
+    which a lid is closed, which the faces do not show.
+    """
     place, arrays = paths[0].parent, _read_arrays(paths)
     camera = _camera(place, arrays)
     eyes = matrices_from_rows_6d(arrays["flame.eyes"][:, 0].reshape(-1, 2, 6))
@@ -81,7 +67,7 @@ def read_tracker_frames(paths: Sequence[Path], face_model: FaceModel) -> Tracker
     viewmats[:, :3, :3], viewmats[:, :3, 3] = arrays["opencv.R"][:, 0], arrays["opencv.t"][:, 0]
     lids = arrays.get(_EYELIDS)
     blinks = 0.0 if lids is None or len(lids) < len(paths) else float((lids > _CLOSED).any((1, 2)).mean())
-    return TrackerFrames(in_front(face, viewmats), camera, blinks)
+    return in_front(face, viewmats), camera, blinks
 
 
 def _read_arrays(paths: Sequence[Path]) -> dict[str, np.ndarray]:
@@ -105,10 +91,10 @@ def _camera(place: Path, arrays: dict[str, np.ndarray]) -> TrackerCamera:
         )
     sizes = arrays.get(_SIZE)
     if sizes is None:
-        return TrackerCamera(K, None)
+        return K, None
     if (sizes != sizes[0]).any():
         raise UserError(f"{place}: {_SIZE!r} is not the same in all checkpoints; {REMEDY}")
-    return TrackerCamera(K, (int(sizes[0, 1]), int(sizes[0, 0])))
+    return K, (int(sizes[0, 1]), int(sizes[0, 0]))
 
 
 def _read_frame(path: Path) -> dict[str, np.ndarray]:

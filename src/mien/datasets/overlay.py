@@ -151,12 +151,11 @@ class Steadiness:
     expression: float | None
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Points of one camera in t frames."""
-
-    pixels: Float[np.ndarray, "t l 2"]
-    facing: Bool[np.ndarray, "t l"]
+_Seen = tuple[Float[np.ndarray, "t l 2"], Bool[np.ndarray, "t l"]]
+"""Points of one camera in t frames, in pixels, and which of them face it."""
+_Deviation = tuple[Float[np.ndarray, " p"], Float[np.ndarray, "2 p"], Float[np.ndarray, "2 p"]]
+"""How far points are from their own median colour, with all coefficients and without those of identity or expression,
+and how far these coefficients move them."""
 
 
 @torch.no_grad()
@@ -193,23 +192,14 @@ def _seen(model: FaceModel, face: FaceParams, view: Camera) -> _Seen:
     normals = torch.linalg.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     place = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
     cosines = torch.nn.functional.cosine_similarity(normals, place - points, dim=-1)
-    return _Seen(view.project(points)[0].double().numpy(), (cosines > _FACING).numpy())
-
-
-@dataclass(frozen=True, eq=False)
-class _Deviation:
-    """How far points are from their own median colour, and how far coefficients move them: one row for each of both."""
-
-    own: Float[np.ndarray, " p"]
-    others: Float[np.ndarray, "2 p"]
-    motions: Float[np.ndarray, "2 p"]
+    return view.project(points)[0].double().numpy(), (cosines > _FACING).numpy()
 
 
 def _deviations(images: list[UInt8[np.ndarray, "h w 3"]], own: _Seen, others: list[_Seen]) -> _Deviation | None:
     """Return what one camera shows of the face, at the points that face it. None if that is too small."""
-    facing = own.facing & (own.facing.sum(0) >= max(_MIN_FRAMES, len(images)) // 2)
-    eyes = float(np.linalg.norm(own.pixels[:, _CORNERS[0]] - own.pixels[:, _CORNERS[1]], axis=-1).mean())
-    pixels = [each.pixels for each in (own, *others)]
+    facing = own[1] & (own[1].sum(0) >= max(_MIN_FRAMES, len(images)) // 2)
+    pixels = [each[0] for each in (own, *others)]
+    eyes = float(np.linalg.norm(pixels[0][:, _CORNERS[0]] - pixels[0][:, _CORNERS[1]], axis=-1).mean())
     if (
         not _MIN_EYES <= eyes <= max(images[0].shape)
         or not facing.any()
@@ -219,7 +209,7 @@ def _deviations(images: list[UInt8[np.ndarray, "h w 3"]], own: _Seen, others: li
     spreads = [_spread(each, facing) for each in _colors(images, pixels, eyes)]
     shifts = [each - pixels[0] for each in pixels[1:]]
     motions = [np.linalg.norm(each - _over_frames(np.nanmean, each, facing), axis=-1)[facing] / eyes for each in shifts]
-    return _Deviation(spreads[0], np.stack(spreads[1:]), np.stack(motions))
+    return spreads[0], np.stack(spreads[1:]), np.stack(motions)
 
 
 def _spread(colours: Float[np.ndarray, "t s l 3"], facing: Bool[np.ndarray, "t l"]) -> Float[np.ndarray, " p"]:
@@ -265,9 +255,8 @@ def _share(parts: list[_Deviation], index: int) -> float | None:
     """Return the spread of colours over that without some coefficients: by squares or lengths, whichever is smaller."""
     if not parts:
         return None
-    own = np.concatenate([each.own for each in parts])
-    other = np.concatenate([each.others[index] for each in parts])
-    motion = np.concatenate([each.motions[index] for each in parts])
+    own = np.concatenate([each[0] for each in parts])
+    other, motion = (np.concatenate([each[place][index] for each in parts]) for place in (1, 2))
     if not np.sqrt((motion**2).mean()) >= _MIN_MOTIONS[index] or not other.mean() > 0:
         return None
     return float(min(np.sqrt((own**2).mean() / (other**2).mean()), own.mean() / other.mean()))

@@ -108,13 +108,22 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
         method = read_run_config(run_dir)["method"]["kind"]
         run = ScoredRun(label, run_dir, method, read_metrics(run_dir))
         with expect_whole(run_dir / "metrics.json", REMEDY):
-            Comparison((run,), tuple(_tables([run])[0]), ()).content()  # stumbles where the name of the file is known
+            _shown(run)
         runs.append(run)
     if not runs:
         listed = ", ".join(run_dirs) or "there is none"
         raise UserError(f"no evaluated run to compare ({listed}); run `mien evaluate DIR --run NAME` first")
     tables, more = _tables(runs)
     return Comparison(tuple(runs), tuple(tables), tuple(warnings + more))
+
+
+def _shown(run: ScoredRun) -> list[str]:
+    """What is shown of a run, as text. A damaged file stumbles here, where its name is known."""
+    training, tables = run.metrics["training"], _tables([run])[0]
+    texts = [str(Comparison((run,), tuple(tables), ()).content())]
+    for entry in (table.rows[0].entry for table in tables):
+        texts += [f"{value:.2f}" for value in (1e3 * entry["seconds_per_frame"], *entry["per_frame"]["head_psnr"])]
+    return [*texts, f"{training['gaussians']:,} {training['seconds']:.0f}"]
 
 
 def _tables(runs: Sequence[ScoredRun]) -> tuple[list[Table], list[str]]:

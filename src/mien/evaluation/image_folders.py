@@ -187,7 +187,8 @@ def read_crops(path: Path) -> dict[str, Box]:
         # The file is beside the user's own pictures, so there is no folder to delete and no stage to run.
         raise UserError(f"{str(error).split('; ')[0]}; write it again, or leave it out") from None
     boxes: dict[str, Box] = {}
-    for name, box in crops.items() if isinstance(crops, dict) else [("", None)]:
+    given: Any = crops.items() if isinstance(crops, dict) else [("", None)]
+    for name, box in given:
         whole = isinstance(box, list) and all(type(each) is int and abs(each) <= 1_000_000 for each in box)
         if not whole or len(box) != 4 or min(box[2:]) < 1:
             raise UserError(f"{path}: {name!r} has no box of 4 numbers (left, top, width, height); write it again")

@@ -54,11 +54,7 @@ def load_experiments(
         if _digests(folder) != digest:
             raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
-    clothes: tuple[UInt8[np.ndarray, "t h p"] | None, ...] = ()
-    if rules is not None and rules.opened:
-        shapes = (sequence.capture.mattes.shape for sequence in sequences)
-        sized = zip(sequence_dirs, shapes, strict=True)
-        clothes = tuple(read_clothes(folder, (t, height, width)) for folder, (t, _, height, width) in sized)
+    clothes = _clothes(sequence_dirs, sequences) if rules is not None and rules.opened else ()
     scored = [{**each, **({"mask": "matte"} if whole else {})} for each in digests]
     for each, packed in zip(scored, clothes, strict=False):
         each |= {} if packed is None else {"clothes": clothes_digest(packed)}
@@ -88,6 +84,14 @@ def load_experiments(
         name: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
         for name, (split, frames) in found.items()
     }
+
+
+def _clothes(folders: Items[Path], sequences: Items[Sequence]) -> tuple[UInt8[np.ndarray, "t h p"] | None, ...]:
+    """The packed masks of clothes of each sequence."""
+    shapes = (sequence.capture.mattes.shape for sequence in sequences)
+    return tuple(
+        read_clothes(folder, (t, height, width)) for folder, (t, _, height, width) in zip(folders, shapes, strict=True)
+    )
 
 
 def _digests(folder: Path) -> dict[str, str]:

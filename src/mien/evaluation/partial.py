@@ -40,7 +40,8 @@ class PartialScores:
             for line in lines[1:]:
                 try:
                     content: dict[str, Any] = parse_json(line)
-                    rows = {name: {key: float(row[key]) for key in row} for name, row in content["scores"].items()}
+                    rows: dict[str, Scores] = {}
+                    rows |= {name: {key: float(row[key]) for key in row} for name, row in content["scores"].items()}
                     found[Frame(*content["frame"])] = (rows, float(content["seconds"]))
                 except (ValueError, LookupError, TypeError, AttributeError):
                     break

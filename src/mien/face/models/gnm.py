@@ -63,8 +63,6 @@ class GnmFile:
     joints: Float[np.ndarray, "4 3"]
     joint_identity: Float[np.ndarray, "i 4 3"]
     weights: Float[np.ndarray, "v 4"]
-    correctives: Float[np.ndarray, "4 9 v 3"] | None
-    """Factors of R - I, row by row. None if all are zero, as in version 3."""
     groups: dict[str, np.ndarray]
     """Vertices of each group."""
     corner_uv: Float[np.ndarray, "f 3 2"] | None
@@ -99,10 +97,12 @@ def read_gnm(path: Path) -> GnmFile:
         _names(path, "expression_names", arrays, sizes["e"]),
         arrays["template_joint_positions"].astype(np.float64)[order],
         arrays["joint_identity_basis"].astype(np.float64)[:, order],
-        arrays["skinning_weights"].astype(np.float64)[order].T, _correctives(path, arrays, order, sizes["v"]),
+        arrays["skinning_weights"].astype(np.float64)[order].T,
         _groups(path, arrays, sizes["v"]), _corner_uv(path, arrays, sizes["f"]),
     )  # fmt: skip
     _check_sense(path, gnm)
+    if np.any(arrays.get("pose_correctives_regressor", 0)):
+        raise UserError(f"{path}: has pose correctives, which version 3 has none of; give gnm_head.npz of version 3")
     return gnm
 
 
@@ -118,9 +118,6 @@ def gnm_face_model(gnm: GnmFile, name: str) -> FaceModel:
     # GNM's head is mien's head, and GNM's root is mien's neck. Both turn about GNM's head joint.
     weights[:, 0], weights[:, 1] = gnm.weights[:, neck], gnm.weights[:, 0]
     weights[:, 2:] = gnm.weights[:, [left, right]]
-    correctives = np.zeros((3, 9, len(gnm.template), 3)) if gnm.correctives is None else gnm.correctives[moving].copy()
-    head = correctives[0].reshape(3, 3, -1, 3).swapaxes(0, 1)  # for the inverse of the head's rotation
-    correctives[0] = head.reshape(9, -1, 3)
     if gnm.corner_uv is None:
         uv, uv_faces = unwrap(gnm.template - origin, gnm.faces)
     else:
@@ -147,7 +144,6 @@ def gnm_face_model(gnm: GnmFile, name: str) -> FaceModel:
         joint_rotation_basis=torch.zeros(e, 4, 3),
         joint_translation_basis=torch.zeros(e, 4, 3),
         skinning_weights=float_tensor(weights),
-        pose_basis=None if gnm.correctives is None else float_tensor(correctives.reshape(27, -1, 3)),
         landmarks={},
     )
 
@@ -158,25 +154,6 @@ def _names(path: Path, key: str, arrays: dict[str, np.ndarray], count: int) -> t
     if len(names) != count or len(set(names)) != count or not plain:
         raise UserError(f"{path}: {key!r} should be {count} different names; download it again")
     return names
-
-
-def _correctives(
-    path: Path, arrays: dict[str, np.ndarray], order: list[int], vertices: int
-) -> Float[np.ndarray, "4 9 v 3"] | None:
-    given = arrays.get("pose_correctives_regressor")
-    if given is None or given.dtype.kind != "f":
-        return None
-    if given.shape != (36, 3 * vertices):
-        raise UserError(f"{path}: 'pose_correctives_regressor' is {list(given.shape)}, but should be "
-                        f"[36, {3 * vertices}]; download it again")  # fmt: skip
-    check_numbers(path, "pose_correctives_regressor", given)
-    if not given.any():
-        return None
-    correctives = given.reshape(4, 9, vertices, 3)[order].astype(np.float32)
-    if correctives[0].any():
-        raise UserError(f"{path}: has pose correctives of its root joint, which no version of GNM Head has; download "
-                        "it again")  # fmt: skip
-    return correctives
 
 
 def _groups(path: Path, arrays: dict[str, np.ndarray], vertices: int) -> dict[str, np.ndarray]:

@@ -18,9 +18,17 @@ from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
-from mien.face.models.arkit_head import JAW_EXPRESSIONS, PINNED, jaw_motion, lid_correctives
+from mien.face.models.arkit_head import (
+    JAW_EXPRESSIONS,
+    PINNED,
+    jaw_basis,
+    jaw_motion,
+    joint_identities,
+    lid_correctives,
+    skinning,
+)
 from mien.face.models.npz import read_npz, readable
-from mien.face.models.schema import in_iris, jaw_basis, neck_weights, rounded
+from mien.face.models.schema import in_iris, rounded
 
 VERTICES, QUADS = 26719, 26384
 """Vertices and faces of the model. Faces are quads; a triangle has -1 as its last corner."""
@@ -111,7 +119,11 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
     deltas = np.stack(list(raw.values()))
     deltas[:, inside | parts["left_eye"] | parts["right_eye"]] = 0
     deltas[[each.startswith("eyeLook") for each in names]] = 0
-    weights = _weights(template, parts)
+    eyes = {"left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}
+    rigid = {"head": inside | parts["mouth"], "jaw": lower, **eyes}
+    weights = skinning(template[:, 1] + 0.5 * template[:, 2], _NECK_PLANES, rigid)
+    ring = (weights[:, 1] > 0.3) & (weights[:, 1] < 0.7)
+    pivots = {"neck": ring, "jaw": lower & parts["teeth"], **eyes}
     uv, uv_faces = unwrap(template, faces)
     return FaceModel(
         name=name,
@@ -131,7 +143,7 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
         joint_parents=JOINT_PARENTS,
         joint_free=(False, True, False, True, True),
         joint_template=rounded(joints),
-        joint_identity_basis=rounded(_joint_identities(identity, weights, parts)),
+        joint_identity_basis=rounded(joint_identities(identity, pivots)),
         joint_rotation_basis=rounded(jaw_basis(names, rotations)),
         joint_translation_basis=rounded(jaw_basis(names, translations)),
         skinning_weights=rounded(weights),
@@ -190,29 +202,6 @@ def _by_arkit(raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         ours = stem if stem in _WHOLE or not side else stem + {"L": "Left", "R": "Right"}.get(side, side)
         found[ours] = found[ours] + delta if ours in found else delta.astype(np.float64)
     return {name: found[name] for name in sorted(found)}
-
-
-def _weights(template: Float[np.ndarray, "v 3"], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "v 5"]:
-    weights = np.zeros((len(template), len(JOINTS)))
-    weights[:, JOINTS.index("neck")] = neck_weights(template[:, 1] + 0.5 * template[:, 2], _NECK_PLANES)
-    weights[parts["inside"] | parts["mouth"]] = 0
-    for joint, part in (("jaw", "lower"), ("left_eye", "left_eye"), ("right_eye", "right_eye")):
-        weights[parts[part]] = 0
-        weights[parts[part], JOINTS.index(joint)] = 1
-    weights[:, 0] = 1 - weights[:, 1:].sum(1)
-    return weights
-
-
-def _joint_identities(
-    identity: Float[np.ndarray, "i v 3"], weights: Float[np.ndarray, "v 5"], parts: dict[str, np.ndarray]
-) -> Float[np.ndarray, "i 5 3"]:
-    """Each joint follows the mean of its part: the neck's ring, the lower teeth, the eyeballs."""
-    neck = weights[:, JOINTS.index("neck")]
-    followed = {"neck": (neck > 0.3) & (neck < 0.7), "jaw": parts["lower"] & parts["teeth"]}
-    basis = np.zeros((len(identity), len(JOINTS), 3))
-    for joint, part in {**followed, "left_eye": parts["left_eye"], "right_eye": parts["right_eye"]}.items():
-        basis[:, JOINTS.index(joint)] = identity[:, part].mean(1)
-    return basis
 
 
 def _regions(

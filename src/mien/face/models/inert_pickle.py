@@ -20,9 +20,11 @@ import numpy as np
 from mien.face.models.npz import MAX_MODEL_BYTES, readable
 
 _MAX_FILE_BYTES = MAX_MODEL_BYTES + (16 << 20)
-_MAX_READS = 400_000
+_MAX_READS = 100_000
 """Most reads of a pickle, at least one for each opcode. FLAME's files have some hundreds; each costs up to about a
 hundred bytes of memory."""
+_Unpickler: Any = pickle._Unpickler  # pyright: ignore[reportPrivateUsage]
+"""Python's own, since that in C allocates by the numbers in the file."""
 _NUMBERS = re.compile(r"[biuf][1248]")  # numpy's type codes for arrays of plain numbers
 
 
@@ -59,7 +61,7 @@ class _CountedBytes(io.BytesIO):
         return super().read(size)
 
 
-class _InertUnpickler(pickle._Unpickler):  # the C one allocates by the numbers in the file
+class _InertUnpickler(_Unpickler):
     """Python's unpickler, in which names are stand-ins. Dictionaries keep the entries whose keys are texts."""
 
     stack: list[Any]
@@ -102,17 +104,17 @@ class _InertUnpickler(pickle._Unpickler):  # the C one allocates by the numbers 
         self._set_entries(values)
 
     dispatch = {
-        **pickle._Unpickler.dispatch,
+        **_Unpickler.dispatch,
         pickle.REDUCE[0]: _call,
         pickle.NEWOBJ[0]: _call,
         pickle.NEWOBJ_EX[0]: _call_with_names,
         pickle.SETITEM[0]: _set_entry,
         pickle.SETITEMS[0]: _set_marked,
         pickle.DICT[0]: _dictionary,
-        pickle.EMPTY_SET[0]: pickle._Unpickler.load_empty_list,
-        pickle.FROZENSET[0]: pickle._Unpickler.load_list,
-        pickle.ADDITEMS[0]: pickle._Unpickler.load_appends,
-        pickle.BYTEARRAY8[0]: pickle._Unpickler.load_binbytes8,
+        pickle.EMPTY_SET[0]: _Unpickler.load_empty_list,
+        pickle.FROZENSET[0]: _Unpickler.load_list,
+        pickle.ADDITEMS[0]: _Unpickler.load_appends,
+        pickle.BYTEARRAY8[0]: _Unpickler.load_binbytes8,
         pickle.FRAME[0]: lambda self: self.read(8),  # what is in the frame is read from the file as well
     }
 

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 
 from mien.errors import UserError
-from mien.face.model import JOINTS
 
 LARGEST_COEFFICIENT = 3.0  # bound of an expression coefficient in standard deviations, as FLAME and GNM have them
 IRIS_RADIUS = 0.0061  # radius of the iris in metres. Anatomy: it hardly differs between people
@@ -95,18 +94,3 @@ def in_iris(template: Float[np.ndarray, "v 3"], center: Float[np.ndarray, " 3"])
     """Return which vertices are on the iris of the eyeball with this centre, which looks ahead, or before it."""
     rays = template - center
     return (rays[:, 2] > 0) & (np.hypot(rays[:, 0], rays[:, 1]) < IRIS_RADIUS)
-
-
-def jaw_basis(names: tuple[str, ...], motions: Mapping[str, np.ndarray]) -> Float[np.ndarray, "e k 3"]:
-    """Return the motions of `JOINTS` by each expression, of which only the jaw's are not 0."""
-    basis = np.zeros((len(names), len(JOINTS), 3))
-    for name, motion in motions.items():
-        basis[names.index(name), JOINTS.index("jaw")] = motion
-    return basis
-
-
-def neck_weights(along: Float[np.ndarray, " v"], planes: tuple[float, float]) -> Float[np.ndarray, " v"]:
-    """Return weights that rise smoothly from 0 at the first value to 1 at the second, which is lower."""
-    top, bottom = planes
-    t = np.clip((top - along) / (top - bottom), 0, 1)
-    return t * t * (3 - 2 * t)
