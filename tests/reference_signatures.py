@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from mien.lab.synthetic.references import REFERENCES, ReferenceCapture
 from mien.lab.synthetic.scene import SyntheticScene
-from mien.lab.synthetic.truth import truth_of
+from mien.lab.synthetic.truth import surface_of
 
 _FILE = Path(__file__).with_suffix(".json")
 _BLOCKS = 4
@@ -39,9 +39,8 @@ def signature_of(scene: SyntheticScene) -> dict[str, list[float]]:
     cameras = sorted({0, len(scene.cameras) - 1})
     frames = [frame for step in timesteps for frame in scene.timestep_frames(step, cameras)]
     images, mattes = (np.stack([getattr(frame, part) for frame in frames]) for part in ("image", "matte"))
-    truth = truth_of(scene)
-    index, landmarks = truth.vertex_index, truth.landmarks
-    vertices = truth.vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
+    index, vertices, landmarks = surface_of(scene)
+    vertices = vertices[timesteps][:, np.linspace(0, len(index) - 1, _VERTICES).astype(int)]
     parts = {
         "means": _blocks(images).mean((2, 4)), "spreads": _blocks(images).std((2, 4)),
         "mattes": _blocks(mattes[..., None]).mean((2, 4)),

@@ -246,6 +246,7 @@ def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.Monk
 
 def test_a_damaged_record_is_told_and_links_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     analyze(workspace, "--parts", "growth")
+    capsys.readouterr()
     edit_json(workspace / "analysis/toy/analysis.json", lambda content: content.update(parts=3))
     assert "analysis.json: incomplete or damaged" in complaint(capsys, "analyze", str(workspace), "--parts", "growth")
     shutil.rmtree(workspace / "analysis")

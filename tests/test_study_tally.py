@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mien.lab.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, StudyKey
-from mien.lab.analysis.study.tally import interval, tally_content, tally_text, wilson
+from mien.lab.analysis.study.tally import interval, student_quantile, tally_content, tally_text, wilson
 
 
 def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:
@@ -23,6 +23,9 @@ def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:
     assert interval(np.ones(15), 10)[1] == pytest.approx(1)
     alone, same = interval(np.array([0.5]), 10), interval(np.full(20, 0.5), 10)
     assert alone[0] < 0.1 < 0.4 < same[0] < 0.5 < same[1] < 0.6 < 0.9 < alone[1]
+    assert student_quantile(1) == pytest.approx(12.706, rel=1e-3)
+    assert student_quantile(2) == pytest.approx(4.303, rel=0.012)
+    assert student_quantile(14) == pytest.approx(2.145, rel=1e-3)
 
 
 def table_3() -> tuple[StudyKey, list[Answers]]:

@@ -59,7 +59,7 @@ def parse(module: ModuleType, name: str, arguments: Sequence[str]) -> Any:
 def parse_options(command: type, prog: str, arguments: Sequence[str]) -> Any:
     """The options of a command. Their defaults are those of the preset and the file that the arguments name."""
     default, names = with_defaults(command, arguments), [argument.partition("=")[0] for argument in arguments]
-    parts = [default, *(part for part in vars(default).values() if isinstance(part, TrainOptions))]
+    parts = [default, *(part for part in vars(default).values() if is_dataclass(part))]
     for name in (name for part in parts for name, value in vars(part).items() if isinstance(value, tuple)):
         if names.count(option := f"--{name.replace('_', '-')}") > 1:
             # The first of its values would be dropped without a word.

@@ -69,7 +69,7 @@ def write_chart(path: Path, charts: Sequence[tuple[str, Sequence[Series], Axes]]
         content = _content(_finite(series), axes)
         legend = content["series"] if len(content["series"]) > 1 else []
         rows.append({**content, "title": title, "top": top, "legend": legend})
-        top += axes.height + _TITLE + _LEGEND * len(legend)
+        top += axes.height + _TITLE + _LEGEND * len(legend) + 8
     width = max(axes.width for _, _, axes in charts)
     text = render("templates/chart.svg", rows=rows, width=width, height=top, title_height=_TITLE, line_height=_LEGEND)
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, replace
 from math import log
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -27,25 +29,15 @@ from mien.lab.analysis.measuring import (
 )
 from mien.lab.analysis.result import Chart, Picture, Result, Table
 from mien.lab.benchmarking.timing import format_machine, measure_machine
-from mien.machine.progress import progress_bar
 from mien.machine.terminal import counted
-from mien.machine.threads import one_torch_thread
 from mien.media.pictures import side_by_side
 from mien.pages.plots import Axes, Series
 from mien.perceptual.distance import PerceptualDistance
 from mien.render import rasterize
 from mien.runtime.filmed import head_angles
-from mien.training.footage.frames import (
-    Frame,
-    FrameOrder,
-    camera_extent,
-    expression_rarity,
-    spread_frames,
-    training_frames,
-)
-from mien.training.footage.sequence import Sequence, Targets
-from mien.training.settings import resolved
-from mien.training.trainer import TrainingData, pretrain, start, step
+from mien.training.footage.frames import Frame, camera_extent, spread_frames, training_frames
+from mien.training.footage.sequence import Sequence
+from mien.training.trainer import train
 
 _TABLE_4 = {
     "NeRFace": (48.0, 2000.0),
@@ -139,32 +131,23 @@ def _snapshots(
     context: Context, experiment: Experiment, frames: list[Frame], steps: list[int]
 ) -> list[tuple[int, int, list[Tensor]]]:
     """Step, number of Gaussians and pictures of `frames` at each of some steps, from one training."""
-    # This method fills no sides.
-    settings = resolved(replace(context.settings, steps=context.options.steps), filled=False)
-    sequences = context.sequences
+    settings, sequences = replace(context.settings, steps=context.options.steps), context.sequences
     trained = training_frames(sequences, settings)
-    weights = expression_rarity(sequences, trained) if settings.frame_order == "rare" else None
-    order = FrameOrder(trained, settings.seed, weights)
-    model, config = context.avatar.face_model, context.avatar.config
-    parts_of = model if config.photometric.needs_parts else None
-    like, cleaned = torch.zeros(()), settings.edges == "cleaned"
-    targets = tuple(
-        Targets(one, settings.resolution, len(sequences), like, parts_of, cleaned=cleaned) for one in sequences
-    )
-    data = TrainingData(order, targets, camera_extent(sequences, trained))
-    snapshots = []
-    state = start(sequences, model, config, settings)
-    with one_torch_thread():
-        pretrain(state, settings, progress_bar)
-    with one_torch_thread(), progress_bar("convergence", settings.steps) as advance:
-        while state.step < settings.steps:
-            before = state.step
-            step(state, data, settings)
-            advance(state.step - before)
-            progress = Progress(before, settings.steps, order.at(before)[1], data.extent, state.step - before)
-            if progress.completes(steps):
-                pictures = [drawn(state.avatar, experiment, frame, progress) for frame in frames]
-                snapshots.append((state.step, len(state.avatar.gaussian_store()), pictures))
+    extent = camera_extent(sequences, trained)
+    snapshots: list[tuple[int, int, list[Tensor]]] = []
+    done = 0
+
+    def watch(avatar: Avatar) -> None:
+        nonlocal done
+        taken = max(1, min(avatar.extras.frames_per_step(), settings.steps - done))
+        progress = Progress(done, settings.steps, done // len(trained), extent, taken)
+        done += taken
+        if progress.completes(steps):
+            pictures = [drawn(avatar, experiment, frame, progress) for frame in frames]
+            snapshots.append((done, len(avatar.gaussian_store()), pictures))
+
+    with TemporaryDirectory(prefix="mien-analysis-") as folder:
+        train(sequences, context.avatar.face_model, context.avatar.config, settings, Path(folder) / "run", watch=watch)
     return snapshots
 
 

@@ -51,7 +51,7 @@ class Analysis:
     @property
     def about_parts(self) -> str:
         """The parts for `mien analyze --help`."""
-        return "; ".join(f"{part.name} ({part.title})" for part in self.parts)
+        return "; ".join(f"{part.name} – {part.title}" for part in self.parts)
 
 
 _GAUSSIAN_AVATARS = Analysis(

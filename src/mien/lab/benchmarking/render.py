@@ -137,6 +137,6 @@ def write_scaling_chart(path: Path, rows: Sequence[BenchmarkRow]) -> None:
             )
             for line, style in zip(lines, styles, strict=False)
         ]
-        title = f"{name.replace('_', ' ')}, {counted(threads, 'thread')}"
-        charts.append((title, series, Axes("Gaussians", "milliseconds (minimum)", 640, 320, logarithmic=True)))
+        title = f"{name.replace('_', ' ')}, {counted(threads, 'thread')}: milliseconds, least"
+        charts.append((title, series, Axes("Gaussians", "milliseconds, least", 640, 320, logarithmic=True)))
     write_chart(path, charts)

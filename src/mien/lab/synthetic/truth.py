@@ -52,12 +52,18 @@ class Truth:
 
 def truth_of(scene: SyntheticScene) -> Truth:
     """Return the truth of a scene, rounded as it is stored."""
+    return Truth(scene.tracking(), *surface_of(scene))
+
+
+def surface_of(
+    scene: SyntheticScene,
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "t n 3"], Float[np.ndarray, "t c l 2"]]:
+    """Return `vertex_index`, `vertices` and `landmarks` of the truth, which are the same on every machine."""
     index = face_region(measure_anatomy(scene.model, scene.identity))
     chosen = torch.from_numpy(index)
     vertices = np.stack([scene.head_vertices(step)[chosen].numpy() for step in range(scene.timesteps)])
     landmarks = np.stack([scene.landmarks(camera) for camera in range(len(scene.cameras))], axis=1)
-    rounded = (_unpacked(_packed(values, unit), unit) for values, unit in ((vertices, _METER), (landmarks, _PIXEL)))
-    return Truth(scene.tracking(), index, *rounded)
+    return index, _unpacked(_packed(vertices, _METER), _METER), _unpacked(_packed(landmarks, _PIXEL), _PIXEL)
 
 
 def face_region(anatomy: Anatomy) -> Int[np.ndarray, " n"]:

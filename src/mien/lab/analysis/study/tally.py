@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import stdtrit
 
 from mien.lab.analysis.study.files import QUESTIONS, Answers, StudyKey
 from mien.lab.benchmarking.comparing import markdown
@@ -98,8 +97,20 @@ def wilson(share: float, count: float, z: float) -> tuple[float, float]:
 
 
 def student_quantile(degrees: int) -> float:
-    """The two-sided quantile of Student's t for `CONFIDENCE`."""
-    return float(stdtrit(degrees, 0.5 + CONFIDENCE / 2))
+    """The two-sided quantile of Student's t for `CONFIDENCE`, by the series of Abramowitz and Stegun (26.7.5).
+
+    It is 1 % too small for 2 degrees of freedom, and far closer for more. For 1 degree it is exact.
+    """
+    if degrees == 1:
+        return math.tan(math.pi * CONFIDENCE / 2)
+    z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
+    terms = (
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return z + sum(term / degrees ** (power + 1) for power, term in enumerate(terms))
 
 
 def tally_text(content: dict[str, Any]) -> str:
