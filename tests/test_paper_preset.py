@@ -346,7 +346,8 @@ def test_help_all_lists_every_setting_of_the_method(method: str, capsys: pytest.
         for leaf in leaves(settings, prefix):
             option = leaf.option(prefix if leaf.name not in MAIN_SETTINGS else "").replace("--.", "--")
             assert leaf.about[0].isupper(), option
-            assert option in about or option in ("--held-out-sequences", "--held-out-cameras")
+            others = ("--held-out-sequences", "--held-out-cameras", "--method.face-tuning.enabled")
+            assert option in about or option in others
 
 
 def test_help_all_shows_the_values_of_a_preset_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -105,10 +105,7 @@ class TrainOptions:
         config = PRESETS[self.preset].config(self.method)
         if self.method_settings is not None:
             config = apply_options(config, self.method_settings)
-        # Two options set face tuning. The one that differs from the default was typed.
-        default = type(self).face_tuning
-        typed = {self.face_tuning, config.face_tuning.enabled} != {default}
-        config = replace(config, face_tuning=replace(config.face_tuning, enabled=default != typed))
+        config = replace(config, face_tuning=replace(config.face_tuning, enabled=self.face_tuning))
         config.check()
         return config
 
