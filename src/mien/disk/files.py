@@ -220,12 +220,12 @@ def read_arrays(path: Path, stage: str = _ANY_STAGE) -> dict[str, np.ndarray]:
 
     No number is infinite. NaN means that a number is not known.
     """
-    return read_safetensors(path, lambda file: _finite(safetensors.numpy.load_file(file), np.isinf), stage)
+    return read_safetensors(path, lambda file: _finite(safetensors.numpy.load_file(file)), stage)
 
 
-def _finite(arrays: Any, isinf: Callable[[Any], Any]) -> Any:
+def _finite(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for name, array in arrays.items():
-        if isinf(array).any():
+        if np.isinf(array).any():
             raise ValueError(f"{name!r} holds infinite numbers")
     return arrays
 
@@ -279,8 +279,7 @@ def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping
 
 
 def read_tensors(path: Path, stage: str = _ANY_STAGE, remedy: str | None = None) -> "dict[str, Tensor]":
-    """Read safetensors as torch tensors on the CPU, as `read_arrays` does; error messages give `remedy`, or `stage`."""
+    """Read safetensors as torch tensors on the CPU; error messages give `remedy`, or `stage`."""
     import safetensors.torch
-    import torch
 
-    return read_safetensors(path, lambda file: _finite(safetensors.torch.load_file(file), torch.isinf), stage, remedy)
+    return read_safetensors(path, safetensors.torch.load_file, stage, remedy)
