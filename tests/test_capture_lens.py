@@ -92,8 +92,7 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
     assert abs(found_dots(next(source.frames()).picture()[..., 0]) - DOTS).max() > 4
     source = type(source)(**{**vars(source), "lens": lens})
     assert abs(found_dots(next(source.frames()).picture()[..., 1]) - DOTS).max() < 0.05
-    settings = CaptureSettings(clean_plate=tmp_path / "plate.png", mattes=mattes, landmarks=tmp_path / "marks.csv")
-    given: Any = read_given(settings, source)
+    given: Any = read_given(source, tmp_path / "plate.png", mattes, tmp_path / "marks.csv")
     assert abs(found_dots(given.plate[..., 2]) - DOTS).max() < 0.05
     assert abs(found_dots(given.mattes.matte(0, whole_picture(WIDTH, HEIGHT, WIDTH))) - DOTS).max() < 0.05
     assert abs(given.landmarks[0, : len(DOTS)] - DOTS).max() < 0.01
@@ -175,7 +174,7 @@ def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) ->
         cv2.imwrite(str(tmp_path / name), speckled(seed)[..., ::-1])
     source = replace(open_source(tmp_path / "pictures", FrameSelection(), 25.0), colors=camera.colors)
     assert np.abs(next(source.frames()).picture() - expected(speckled(1), matrix)).max() < 0.6
-    given: Any = read_given(CaptureSettings(clean_plate=tmp_path / "plate.png", mattes=tmp_path / "mattes"), source)
+    given: Any = read_given(source, tmp_path / "plate.png", tmp_path / "mattes", None)
     assert np.abs(given.plate - expected(speckled(2), matrix)).max() < 0.6
     assert (given.mattes.matte(0, whole_picture(80, 60, 80)) == speckled(3)[..., 1]).all()
 

@@ -198,7 +198,9 @@ def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
     assert isinstance(control, GradientDensity)
     assert control.settings.max_gaussians == plain_gaussian_avatars().density.max_gaussians + int(fills.sum())
     posed = avatar.pose(toy[1].tracking.face[0])
-    density_strategy(control, store).adapt(store, posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
+    strategy = density_strategy(control, store)
+    assert strategy is not None
+    strategy.adapt(store, posed, Progress(39, 100, 0, 1.0), lambda: torch.Generator())
     opacities, filled_in = store["opacity_logits"].sigmoid(), known(unseen.filled_in(surface_of(avatar)))
     assert opacities[filled_in].equal(before[filled_in])
     assert (opacities[filled_in] > 0.69).all(), "fills have 0.97, and strands 0.7"

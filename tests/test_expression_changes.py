@@ -112,7 +112,9 @@ def test_children_inherit_the_bases_and_faint_ones_are_judged_at_their_best() ->
     seen = torch.full((len(avatar.store),), 0.7)
     assert avatar.density().judged_opacities is None, "by the highest opacity of each"
     fixed = new_avatar(expression_changes=("color", "offset"))
-    assert not torch.equal(fixed.density().judged_opacities(fixed.store, seen[:-2]), seen[:-2])
+    judged = fixed.density().judged_opacities
+    assert judged is not None
+    assert not torch.equal(judged(fixed.store, seen[:-2]), seen[:-2])
 
 
 def test_the_prior_is_the_mean_square_of_the_changes() -> None:

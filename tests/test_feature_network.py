@@ -112,6 +112,7 @@ def update_of(dtype: torch.dtype = torch.float32, n: int = 2000, k: int = 5, f: 
 def test_first_update_of_a_row_moves_by_about_the_rate_and_rows_without_gradient_stay() -> None:
     update = update_of(torch.float64)
     before, columns = update.values.clone(), update.terms[0][1]
+    assert isinstance(update.moments, FactoredMoments)
     second, weights = update.moments.second.clone(), update.moments.weights.clone()
     factored_update(update)
     moved = (update.values - before)[1::6].abs()  # no update so far, and a gradient now
@@ -159,6 +160,7 @@ def test_published_update_has_the_bits_of_adam_with_the_whole_gradient(isa: str)
     factored, whole = published(torch.float32, 19, 1), published(torch.float32, 19, 1)
     ((rows, columns),) = whole.terms
     factored_update(factored)
+    assert isinstance(whole.moments, Moments)
     update_all([Update(whole.values, rows[:, None] * columns[:, None], whole.moments, whole.rate)])
     assert factored.values.equal(whole.values)
     assert all(getattr(factored.moments, n).equal(getattr(whole.moments, n)) for n in ("first", "second", "step"))

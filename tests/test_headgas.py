@@ -212,6 +212,7 @@ def test_starts_faint_gray_and_still_and_is_judged_as_it_is_drawn(variant: Varia
     avatar = new_variant(variant)
     expected = avatar.pose(face).gaussians.opacities.expand(5, 40).amax(0).detach()
     judged = avatar.density().judged_opacities
+    assert judged is not None
     torch.testing.assert_close(judged(avatar.store, torch.zeros(40)), expected)
     assert torch.equal(judged(avatar.store, torch.ones(40)), torch.ones(40))
 

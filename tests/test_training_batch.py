@@ -77,6 +77,7 @@ def test_losses_of_a_picture_are_means_and_steps_pass_every_multiple_once() -> N
 @pytest.mark.unchecked
 def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     state, data = new_state()
+    assert state.density is not None
     rounds, seen, adapt = [], [], state.density.adapt
     monkeypatch.setattr(state.density, "adapt", lambda *given: rounds.append(adapt(*given)) or rounds[-1])
     while state.step < SETTINGS.steps:

@@ -143,6 +143,7 @@ def factored_inputs(size: tuple[int, int]) -> Tensors:
     """An update of rows of so many features, with so many terms, of which some lack rows that others have."""
     f, terms = size
     update = features.update_of(f=f)
+    assert isinstance(update.moments, FactoredMoments)
     more = [random(2000, f, seed=7), random(5, seed=8), random(2000, f, seed=9), torch.zeros(5)]
     more[0][1::3] = 0
     both = [*update.terms[0], *more[: 2 * (terms - 1)]]
@@ -160,6 +161,7 @@ def factored(given: Tensors, native: bool) -> Tensors:
 
 def published_inputs(size: tuple[int, int]) -> Tensors:
     update = features.published(torch.float32, *size)
+    assert isinstance(update.moments, Moments)
     return [update.values, update.moments.first, update.moments.second, *(one for term in update.terms for one in term)]
 
 

@@ -146,6 +146,7 @@ def test_threads_do_not_change_a_bit() -> None:
         store = state.avatar.gaussian_store()
         tensors = {name: store[name].detach().clone() for name in store.names()}
         tensors |= {f"{name}.second": moments.second for name, moments in store.moments.items()}
+        assert state.density is not None
         return tensors | state.density.state() | state.track.state()
 
     first, *others = by_threads(trained, (1, 2, 3))

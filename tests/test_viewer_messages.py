@@ -112,5 +112,5 @@ def test_a_failure_is_told_and_the_viewer_goes_on(serving: Serving, monkeypatch:
     monkeypatch.setattr(serving.session, "set_expression", fail)
     monkeypatch.setattr(panel, "screenshot", fail)
     press(serving, ("jaw open", 0.5), ("Screenshot", True))
-    until(lambda: serving.failures)
+    until(lambda: bool(serving.failures))
     assert capsys.readouterr().err.count("failed, and the viewer goes on (ArithmeticError: a bug)") == 1

@@ -99,7 +99,7 @@ def told_of(file: Path, kind: type[Exception]) -> Iterator[None]:
 def resume_run(root: Path, file: Path) -> Any:
     face_model, sequence = toy_sequence(timesteps=5, size=32)
     state = start([sequence], face_model, CONFIG, replace(SETTINGS, split="tail"))
-    resume(root / RUN / "checkpoints", state, SETTINGS.record_every)
+    resume(root / RUN / "checkpoints", state)
     return state.avatar
 
 
