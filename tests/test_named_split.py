@@ -42,7 +42,7 @@ SUBJECTS = {
 
 def given(names: Any, folder: str = "306", subject: str | None = None, cameras: Any = None) -> Recordings:
     """Return sequences whose captures have these cameras, or were not read."""
-    ids = cameras if isinstance(cameras, dict) else dict.fromkeys(names, cameras)
+    ids: dict[str, Any] = cameras if isinstance(cameras, dict) else dict.fromkeys(names, cameras)
     return Recordings({name: None if ids[name] is None else Recorded(ids[name], 10) for name in names}, folder, subject)
 
 

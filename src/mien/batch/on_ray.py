@@ -33,7 +33,7 @@ def run(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> Iter
     except Exception as error:  # Ray has no class of its own for this
         why = " ".join(str(error).split())[:300]
         raise UserError(f"Ray cannot be reached or started ({why}); see `ray status`, and --ray-address") from None
-    task: Any = ray.remote(lambda work, row: work(row))
+    task: Any = ray.remote(lambda work, row: work(row))  # pyright: ignore[reportCallIssue]
     running: dict[Any, Row] = {}
     unfitting: dict[Any, float] = {}
     waiting = list(reversed(rows))
