@@ -173,7 +173,7 @@ def test_the_same_with_any_number_of_threads(monkeypatch):
 
 def test_landmarks_cost_what_they_cost_other_schedules(case, monkeypatch):
     """The detector's whole response counts, with turns and expressions."""
-    monkeypatch.setattr(terms, "_gaps", lambda *_: torch.zeros(1))
+    monkeypatch.setattr(terms, "gap_costs", lambda *_: torch.zeros(1))
     settings, random = PAPER, torch.Generator().manual_seed(0)
     plain = scene_of(case, settings)[3].response
     scene, fit, shot, model = scene_of(case, settings, **{

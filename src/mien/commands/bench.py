@@ -41,8 +41,7 @@ class _Timed:
     seconds: float = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
 
-    def check(self) -> None:
-        """Check that there is time to measure."""
+    def _check_seconds(self) -> None:
         if not 0 < self.seconds < math.inf:
             raise UserError(f"--seconds {self.seconds:g}: give a positive number; each row is measured for that long")
 
@@ -56,7 +55,7 @@ class Render(_Timed):
 
     def check(self) -> None:
         """Check that CUDA has gsplat and that there is time to measure."""
-        super().check()
+        self._check_seconds()
         check_device(self.device)
 
     def run(self) -> None:
@@ -79,7 +78,7 @@ class Scaling(_Timed):
         """Check before any measurement that the chart can be written and that there is time to measure."""
         from mien.disk.files import check_writable
 
-        super().check()
+        self._check_seconds()
         if self.plot is not None:
             if self.plot.suffix != ".svg":
                 raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
@@ -112,7 +111,7 @@ class TrainStep(_Timed):
 
     def check(self) -> None:
         """Check that CUDA has gsplat and that there is time to measure."""
-        super().check()
+        self._check_seconds()
         check_device(self.device)
         if self.method not in GPU_BENCHMARKS and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")

@@ -49,7 +49,7 @@ class Command:
         from mien.disk.files import check_writable
 
         kind, options = _kind(self.out, self.format), self.options
-        options.check(self.out)
+        kind.check(self.out, options)
         series = options.series if isinstance(options, MotionOptions) else None
         if self._is_file():
             self._check_file(options)

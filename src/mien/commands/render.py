@@ -55,7 +55,7 @@ class _Look:
     """Device that poses and draws: cpu, cuda (an NVIDIA GPU, through gsplat), or auto (a GPU if there is one)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
 
-    def check(self) -> None:
+    def _check_look(self) -> None:
         """Check numbers and the device without heavy libraries."""
         check_device(self.device)
         self.picture.color()
@@ -132,7 +132,7 @@ class Render(_Look):
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        super().check()
+        self._check_look()
         if self.frames < 1:
             raise UserError(f"--frames {self.frames}: give 1 or more")
         if not 0 < self.fps <= 1000:
@@ -285,7 +285,7 @@ class Sheet(_Look):
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        super().check()
+        self._check_look()
         open_workspace(self.workspace).pick_run(self.run_name)
         if self._output.suffix.lower() != ".png" or "%" in self._output.name:
             raise UserError(f"{self._output}: a sheet is one picture; give --out NAME.png")

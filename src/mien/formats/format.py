@@ -44,29 +44,26 @@ class Content(ABC):
     def pose(self) -> "mien.gaussians.Gaussians":
         """Return the Gaussians with the expression that was asked for: the head at the origin, +y up, +z ahead."""
 
+    @abstractmethod
     def poses(self) -> "tuple[Iterator[Content], float] | None":
         """Return the content in the pose of each frame of the motion, and frames per second; None without a motion."""
-        return None
 
+    @abstractmethod
     def motion(self) -> "mien.formats.shared.packed.Motion | None":
         """Return the motion that was asked for, as face parameters with head poses; None without one."""
-        return None
 
+    @abstractmethod
     def mesh(self) -> "mien.formats.glb.MeshModel":
         """Return the person's mesh with its texture coordinates, which only a run has."""
-        raise UserError("a file does not have all that this format needs; export its workspace")
 
+    @abstractmethod
     def trained(self) -> "tuple[mien.avatar.avatar.Avatar, mien.face.params.FaceParams]":
         """Return the trained avatar, and the person at all timesteps of its training, which only a run has."""
-        raise UserError("a file does not have all that this format needs; export its workspace")
 
 
 @dataclass(frozen=True)
 class NoOptions:
     """Options of a format: nothing can be chosen. Formats with options have a class of their own beside the writer."""
-
-    def check(self, path: Path) -> None:
-        """Check, before any work, the values, and that the packages which write the file are installed."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +79,6 @@ class MotionOptions(NoOptions):
     every: int = 1
     """With --series, take only every n-th frame."""
 
-    def check(self, path: Path) -> None:
-        """Check that there is a motion if something is said of it."""
-        if self.every < 1:
-            raise UserError(f"--every {self.every}: give 1 or more")
-        if self.series is None and (self.every > 1 or self.neutral is not None):
-            raise UserError(f"{path}: --every and --neutral are for a motion; name it with --series, or leave them out")
-
 
 @dataclass(frozen=True)
 class PoseOptions(MotionOptions):
@@ -97,6 +87,15 @@ class PoseOptions(MotionOptions):
     set: tuple[str, ...] = ()
     """Expressions and whole faces by name, and joint angles in radians, for example --set smile=0.6 jawOpen=0.3
     eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
+
+
+def check_options(path: Path, options: NoOptions) -> None:
+    """Check that there is a motion if something is said of it."""
+    if isinstance(options, MotionOptions):
+        if options.every < 1:
+            raise UserError(f"--every {options.every}: give 1 or more")
+        if options.series is None and (options.every > 1 or options.neutral is not None):
+            raise UserError(f"{path}: --every and --neutral are for a motion; name it with --series, or leave them out")
 
 
 @dataclass(frozen=True)
@@ -117,6 +116,8 @@ class Format:
     """Function that reads the whole avatar in a file. It raises UserError in one line that names the path."""
     options: Callable[[], NoOptions] = PoseOptions
     """Class of the options. The command line has an option for each of its fields."""
+    check: Callable[[Path, Any], None] = check_options
+    """Checks the options before any work, and that the packages which write the file are installed."""
 
 
 def pose_words(path: Path, content: Content) -> str:

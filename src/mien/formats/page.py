@@ -17,7 +17,7 @@ from jaxtyping import Float64, UInt8
 from mien import runtime
 from mien.disk.files import check_writable, write_atomically
 from mien.errors import UserError
-from mien.formats.format import Content, MotionOptions
+from mien.formats.format import Content, MotionOptions, check_options
 from mien.formats.mien import MienOptions
 from mien.formats.shared.packed import Motion, pack, unpacked
 from mien.formats.shared.thinning import fitted
@@ -44,12 +44,6 @@ class PackedOptions(MotionOptions, MienOptions):
     largest: float | None = None
     """Largest size of the file in MB. Gaussians that add least to pictures are left out until it fits (default: all
     stay)."""
-
-    def check(self, path: Path) -> None:
-        """Check that a file can have that size."""
-        super().check(path)
-        if self.largest is not None and not self.largest > 0:
-            raise UserError(f"--largest {self.largest:g}: give a number of MB above 0")
 
     @property
     def most_bytes(self) -> int | None:
@@ -78,22 +72,28 @@ class PageOptions(PackedOptions):
     """The address at which you will publish the page, such as https://example.org/me.html. Messengers then show a
     picture of the avatar, which is written beside the page."""
 
-    def check(self, path: Path) -> None:
-        """Check the address, and that the files for a webcam are there."""
-        super().check(path)
-        if self.address is not None:
-            parts = urlsplit(self.address)
-            if parts.scheme not in ("http", "https") or not parts.hostname:
-                raise UserError(
-                    f"--address {self.address}: is no address; give one such as https://example.org/me.html"
-                )
-        if self.has_webcam:
-            webcam_files(self.webcam_model)
-
     @property
     def has_webcam(self) -> bool:
         """Whether the viewer's face can drive the avatar."""
         return self.webcam or self.webcam_model is not None
+
+
+def check_packed(path: Path, options: PackedOptions) -> None:
+    """Check that a file can have the size that is asked for."""
+    check_options(path, options)
+    if options.largest is not None and not options.largest > 0:
+        raise UserError(f"--largest {options.largest:g}: give a number of MB above 0")
+
+
+def check_page(path: Path, options: PageOptions) -> None:
+    """Check the address, and that the files for a webcam are there."""
+    check_packed(path, options)
+    if options.address is not None:
+        parts = urlsplit(options.address)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise UserError(f"--address {options.address}: is no address; give one such as https://example.org/me.html")
+    if options.has_webcam:
+        webcam_files(options.webcam_model)
 
 
 def _head_part(avatar: runtime.Avatar, title: str, address: str | None, poster: Path) -> str:

@@ -20,14 +20,23 @@ def _of(place: str) -> Callable[..., Any]:
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 _OWN = (
     Format("mien", "avatar", _of("mien:write"), (".mien",), _of("mien:read_portable"), _of("mien:MienOptions")),
-    Format("html", "avatar", _of("page:write"), (".html",), options=_of("page:PageOptions")),
-    Format("packed", "avatar", _of("page:write_packed_file"), (".packed",), options=_of("page:PackedOptions")),
+    Format(
+        "html", "avatar", _of("page:write"), (".html",), options=_of("page:PageOptions"), check=_of("page:check_page")
+    ),
+    Format(
+        "packed",
+        "avatar",
+        _of("page:write_packed_file"),
+        (".packed",),
+        options=_of("page:PackedOptions"),
+        check=_of("page:check_packed"),
+    ),
     Format("glb", "avatar", _of("glb:write"), (".glb",), _of("glb:read_glb_avatar"), _of("glb:GlbOptions")),
     Format("vrm", "avatar", _of("vrm:write"), (".vrm",), options=NoOptions),
     Format("ply", "pose", _of("ply:write"), (".ply",), options=_of("ply:PlyOptions")),
     Format("spz", "pose", _of("spz:write"), (".spz",), options=_of("spz:SpzOptions")),
     Format("sog", "pose", _of("sog:write"), (".sog",), options=_of("shared.splats:SplatOptions")),
-    Format("usd", "sequence", _of("usd:write"), _USD, options=_of("usd:UsdOptions")),
+    Format("usd", "sequence", _of("usd:write"), _USD, check=_of("usd:check_usd_options")),
     Format("gaussian-avatars", "folder", _of("gaussian_avatars:write"), options=NoOptions),
 )
 

@@ -9,7 +9,6 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from mien.disk.files import write_atomically
 from mien.disk.reading import open_ordinary
 from mien.errors import UserError
-from mien.formats.format import Content, PoseOptions, pose_words
+from mien.formats.format import Content, PoseOptions, check_options, pose_words
 from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
 
 if TYPE_CHECKING:
@@ -28,14 +27,10 @@ _MAX_BYTES = 1 << 28
 _REMEDY = "give a USD file of `mien export`"
 
 
-@dataclass(frozen=True)
-class UsdOptions(PoseOptions):
-    """Options of USD files."""
-
-    def check(self, path: Path) -> None:
-        """Check that usd-core is installed."""
-        super().check(path)
-        check_usd(path)
+def check_usd_options(path: Path, options: PoseOptions) -> None:
+    """Check the options, and that usd-core is installed."""
+    check_options(path, options)
+    check_usd(path)
 
 
 def check_usd(path: Path) -> None:
@@ -214,7 +209,7 @@ def _add_pose(path: Path, field: Any, gaussians: "mien.gaussians.Gaussians", tim
         field.CreateSortingModeHintAttr().Set("zDepth")
 
 
-def write(path: Path, content: Content, options: UsdOptions) -> str:
+def write(path: Path, content: Content, options: PoseOptions) -> str:
     """Write the file, and return what is told of it."""
     moving = content.poses()
     if moving is None:

@@ -138,10 +138,10 @@ def landmark_terms(scene: PaperScene, target: Target, moving: Moving) -> Float[T
     state, identity = moving.row.double()[None], moving.identity.double()
     projected = term.model.project(state, identity, scene.bias + moved, cameras, views.row)
     residual = projected - views.detected
-    return (term.robust(residual, views)[0] + _gaps(term, residual)).sum().float()
+    return (term.robust(residual, views)[0] + gap_costs(term, residual)).sum().float()
 
 
-def _gaps(term: LandmarkTerm, residual: Float[Tensor, "n l 2"]) -> Float[Tensor, " n"]:
+def gap_costs(term: LandmarkTerm, residual: Float[Tensor, "n l 2"]) -> Float[Tensor, " n"]:
     """The cost of the gaps between lids and between lips, each with the weight of its upper landmark."""
     upper, lower = (torch.tensor(column) for column in zip(*_GAPS, strict=True))
     of_gaps = replace(term, weights=term.weights[upper])
