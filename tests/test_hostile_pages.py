@@ -116,6 +116,7 @@ def test_a_name_that_looks_like_a_mark_stays_a_name(tmp_path: Path) -> None:
 
 def test_code_is_marked_and_texts_are_escaped() -> None:
     assert with_code("run `mien <b>` & wait") == "run <code>mien &lt;b&gt;</code> &amp; wait"
-    page = render("tracking/report/templates/preview.html", refresh=None, picture='"><script>')
+    content = {"stage": "", "done": "", "seconds": "", "clock": "", "rows": [], "charts": []}
+    page = render("tracking/report/templates/preview.html", refresh=None, name='"><script>', **content)
     assert not any(part in page for part in ("<script>", "http-equiv"))
-    assert 'content="3"' in render("tracking/report/templates/preview.html", refresh="3", picture="")
+    assert 'content="3"' in render("tracking/report/templates/preview.html", refresh="3", name="", **content)

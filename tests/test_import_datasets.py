@@ -201,9 +201,9 @@ def test_mistakes_are_told(made: Path, tmp_path: Path, capsys: pytest.CaptureFix
         (("import", str(tmp_path / "D"), *into), "binding_0 of Gaussian"),
         (("render", imported, "--out", f"{out}.png", "--timestep", "5"), "has the timesteps 0 to 4"),
         (("export", imported, "--out", f"{out}.ply", *as_folder), "writes a folder"),
-        (("export", imported, *into, *as_folder, "--every", "2"), "holds every timestep"),
+        (("export", imported, *into, *as_folder, "--every", "2"), "--every is an option of html"),
         (("export", imported, "--out", f"{out}.mien", "--format", "ply"), "does not end in .ply"),
-        (("export", imported, "--out", f"{out}.ply", "--format", "usd"), "in .usd or .usda or .usdc"),
+        (("export", imported, "--out", f"{out}.ply", "--format", "usd"), "in .usd, .usda, .usdc or .usdz"),
         (("evaluate", imported), ""),  # An imported run is not scored or continued.
         (("train", imported), ""),
     ):

@@ -175,7 +175,9 @@ def test_a_sequence_that_cannot_be_read_back_is_refused(tmp_path: Path) -> None:
     capture = replace(toy.capture, timestamps=toy.capture.timestamps[::-1].copy())
     dataset = Dataset("toy", "a toy", "sequences", lambda path: None, lambda path, model: [])
     folder = tmp_path / "sequences/clip"
-    with pytest.raises(UserError, match=r"^me \(clip\): timestamps holds impossible numbers; copy the files"):
+    with pytest.raises(
+        UserError, match=r"^me \(clip\): incomplete or damaged \(.*impossible times.*\); copy the files"
+    ):
         write_sequence(folder, TrackedSequence(capture, toy.tracking, model), dataset, Path("me"))
     assert list((tmp_path / "sequences").iterdir()) == []
     write_sequence(folder, TrackedSequence(toy.capture, toy.tracking, model), dataset, Path("me"))

@@ -93,7 +93,8 @@ def test_a_preset_that_the_method_does_not_have_is_refused(workspace, capsys, mo
 def test_options_reach_every_depth_and_win_over_the_file_and_the_file_over_the_preset(choices: Any) -> None:
     line = """--method.sh-degree 2 --method.sh-frame head --method.density.max-gaussians=20000 --training.resolution 256
         --method.means-rate.start 4e-3 --method.means-rate.end 4e-5 --method.photometric.alpha_weight 0.1 --steps 70
-        --method.density.opacity-resets 0.2 0.5 --training.record-every 7 --method.face-tuning.begin 0.5"""
+        --method.density.opacity-resets 0.2 0.5 --training.record-every 7 --method.face-tuning.begin 0.5
+            --method.face-tuning.head-translation 4e-4"""
     config = replace(
         STANDARD, sh_degree=2, sh_frame="head", means_rate=Rate(4e-3, 4e-5),
         photometric=replace(STANDARD.photometric, alpha_weight=0.1),

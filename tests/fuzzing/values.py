@@ -113,26 +113,24 @@ VALUES: dict[str, tuple[Row, ...]] = {
         for crop in ([-1, 0, 8, 8], [0, 0, 33, 8], [2**31 - 1, 0, 2**31 - 1, 1], [0, 0, 0, 0], [4, 4, 0, 20])
     ),
     "config.json": (
-        ("data.0.camera.width", 10**9), ("data.0.camera.K", [[3e38] * 3] * 3), ("data.0.camera.K", "wide"),
-        ("data", []), ("settings", [{"split": 1}]), ("method", {"kind": 3}), ("command_line", [1]), ("method", GONE),
-        ("settings", GONE), ("data", GONE),
+        ("data.0.camera.K", "wide"),
+        ("data", []), ("settings", [{"split": 1}]), ("data", GONE),
         *(("data.0.sequence", name) for name in ("../../../home", "/etc", NOT_ONE_LINE, 3, None)),
     ),
     "training.json": (("steps", "many"), ("seconds", HUGE)),
     "curves.safetensors": (
-        ("loss", new(2, 2)), ("loss", GONE), ("psnr", GONE), ("step", last(1e300)), ("loss", fill(np.nan)),
+        ("loss", new(2, 2)), ("loss", GONE), ("psnr", GONE),
     ),
     "faces of a run": (("expression", fill(np.nan)), ("expression", new(5, 9))),
     "metrics.json": (
         ("protocols", []), (_TAIL, 3), (f"+protocols.{NOT_ONE_LINE}", Of("protocols", "self_reenactment_tail")),
         ("protocols", Of("protocols", "self_reenactment_tail", "novel")), ("training", GONE),
-        ("training", {"gaussians": "many", "seconds": 1}), (f"+{_TAIL}.baselines.other", {"psnr": 1.0}),
-        (f"+{_TAIL}.eyes", {"psnr": "high"}),
+        ("training", {"gaussians": "many", "seconds": 1}),
         *((f"{_TAIL}.{place}", value) for place, value in (
-            ("psnr", "high"), ("psnr", None), ("psnr", HUGE), ("ssim", [1]), ("head", None), ("head", GONE),
-            ("face_params", "guessed"), ("frames", "1"), ("split", {}), ("baselines", [1]),
+            ("psnr", "high"), ("psnr", HUGE), ("ssim", [1]), ("head", None),
+            ("face_params", "guessed"), ("split", {}), ("baselines", [1]),
             ("baselines.mesh", {"psnr": 1.0}), ("scored_on", ["clip"]), ("per_frame", GONE),
-            ("per_frame.timestep", []), ("per_frame.head_psnr", ["x"]), ("perceptual_backbone", [1]),
+            ("per_frame.head_psnr", ["x"]), ("perceptual_backbone", [1]),
             ("seconds_per_frame", None),
         )),
     ),

@@ -12,6 +12,7 @@ from mien.avatar.methods import method_named, method_of
 from mien.disk.config import decode, encode, for_loading
 from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.disk.inside import check_subtrees, check_tree
+from mien.disk.limits import MAX_NUMBER
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -119,14 +120,29 @@ def _filmed(tensors: dict[str, Tensor], avatar: Avatar, folder: Path) -> Filmed 
 def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: Path) -> None:
     """Replace every tensor of an avatar. The number of Gaussians may change. A record of it must be possible."""
     with expect_whole(source, "train it again"):
-        if gaussians not in {len(tensor) for tensor in state.values() if tensor.ndim}:
-            raise ValueError(f"no tensor has {gaussians} Gaussians")
+        _check_fits(avatar.state_dict(), state, gaussians)
         avatar.gaussian_store().resize(gaussians)
         avatar.load_state_dict(state)
         # A few avatars have no record, and only drawing them can tell.
         fault = baked_fault(avatar.bake()) if avatar.extras.unbaked is None else None
     if fault is not None:
         raise UserError(f"{source}: cannot be posed ({fault}); train it again")
+
+
+def _check_fits(own: dict[str, Tensor], state: dict[str, Tensor], gaussians: int) -> None:
+    """Check that `state` can replace `own`, before memory for the Gaussians is allocated."""
+    for name, tensor in own.items():
+        found = state[name]
+        if found.dtype != tensor.dtype or found.shape[1:] != tensor.shape[1:] or found.ndim != tensor.ndim:
+            raise ValueError(f"{name!r} is of type {found.dtype} and shape {list(found.shape)}")
+        if found.is_floating_point() and not (found.numel() == 0 or bool(found.abs().max() <= MAX_NUMBER)):
+            raise ValueError(f"{name!r} holds NaN or numbers beyond {MAX_NUMBER:g}")
+        # Baking narrows indices to 32 bits: what is larger would come round to one that exists.
+        if found.dtype == torch.int64 and found.numel() > 0 and not (found.min() >= 0 and found.max() < 2**31):
+            raise ValueError(f"{name!r} holds numbers that are not indices")
+    known = {len(tensor) for tensor in state.values() if tensor.ndim > 0 and tensor[:1].numel() > 0}
+    if gaussians and gaussians not in known:
+        raise ValueError(f"no tensor has {gaussians} Gaussians")
 
 
 def _face_model_of(folder: Path, content: _Content) -> FaceModel:

@@ -120,7 +120,7 @@ def compare_runs(run_dirs: Mapping[str, Path]) -> Comparison:
 def _shown(run: ScoredRun) -> list[str]:
     """What is shown of a run, as text. A damaged file stumbles here, where its name is known."""
     training, tables = run.metrics["training"], _tables([run])[0]
-    texts = [str(Comparison((run,), tuple(tables), ()).content())]
+    texts = [str(Comparison((run,), tuple(tables), ()).content()), *(table.ground for table in tables)]
     for entry in (table.rows[0].entry for table in tables):
         texts += [f"{value:.2f}" for value in (1e3 * entry["seconds_per_frame"], *entry["per_frame"]["head_psnr"])]
     return [*texts, f"{training['gaussians']:,} {training['seconds']:.0f}"]

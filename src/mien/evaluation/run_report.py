@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mien.disk.files import write_atomically
+from mien.disk.files import expect_whole, write_atomically
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, Living
@@ -67,7 +67,8 @@ def write_report(
     first = next(iter(results.values()), None)
     hero = sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None
     page = f"../../{LIVING_PAGE}" if (path.parent / "../.." / LIVING_PAGE).is_file() else None
-    text = report_html(run, protocols, results, videos, driven, hero, page)
+    with expect_whole(path.parent, "train and evaluate it again"):
+        text = report_html(run, protocols, results, videos, driven, hero, page)
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 

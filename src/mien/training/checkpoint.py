@@ -117,25 +117,44 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
     def part(prefix: str) -> dict[str, Tensor]:
         return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
+    for name, tensor in tensors.items():
+        if not name.startswith("curves.") and not bool(tensor.isfinite().all()):
+            raise ValueError(f"{name} is not finite")
     overwrite(state.avatar, part("avatar."), int(tensors["gaussians"]), path)
     store = state.avatar.gaussian_store()
-    like = store[store.names()[0]]
-    store.moments.update(_moments(part("store."), like))
-    state.adam.load_state(_moments(part("adam."), like))
+    store.moments.update(_moments(part("store."), {name: store[name] for name in store.names()}))
+    own = [group for group in state.avatar.parameter_groups() if group.moments is None]
+    state.adam.load_state(
+        _moments(part("adam."), {f"{group.name}/{name}": each for group in own for name, each in group.tensors.items()})
+    )
     if state.density is not None:
+        for name, counted in state.density.state().items():
+            _check_shape(name, tensors[f"density.{name}"], (len(store), *counted.shape[1:]), counted.dtype)
         state.density.load_state(part("density."))
     state.track.load_state(part("track."))
     for prefix, joined in state.joined().items():
         joined.load_state(part(f"{prefix}."))
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
     state.peak_memory_mb = float(tensors["peak_memory_mb"])
-    state.curves = {name: curve.tolist() for name, curve in part("curves.").items()}
+    curves = part("curves.")
+    if state.step < 0 or len({curve.shape for curve in curves.values()}) > 1 or ("loss" in curves) != bool(curves):
+        raise ValueError("its step or its curves are not valid")
+    state.curves = {name: curve.tolist() for name, curve in curves.items()}
 
 
-def _moments(tensors: dict[str, Tensor], like: Tensor) -> dict[str, Moments | FactoredMoments]:
-    """The moments by name, on the device of `like`, except for the step counts, which stay on the CPU."""
+def _moments(tensors: dict[str, Tensor], owners: dict[str, Tensor]) -> dict[str, Moments | FactoredMoments]:
+    """The moments by name, on the device of their owners, except for the step counts, which stay on the CPU."""
     fields_of: dict[str, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
         name, _, field = key.rpartition(":")
-        fields_of.setdefault(name, {})[field] = tensor if field == "step" else tensor.to(like.device)
+        owner = owners[name]
+        if field != "step":
+            factored = {"second": owner[:, 0].shape, "weights": owner.shape[:1]} if f"{name}:weights" in tensors else {}
+            _check_shape(key, tensor, factored.get(field, owner.shape), owner.dtype)
+        fields_of.setdefault(name, {})[field] = tensor if field == "step" else tensor.to(owner.device)
     return {name: (FactoredMoments if "weights" in own else Moments)(**own) for name, own in fields_of.items()}
+
+
+def _check_shape(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    if tensor.shape != shape or tensor.dtype != dtype:
+        raise ValueError(f"{name} is of type {tensor.dtype} and shape {list(tensor.shape)}")

@@ -184,13 +184,19 @@ def frame_gains(
     return FrameGains(sequences, frames, like)
 
 
+_MOST = 100.0  # largest gain, and inverse of the smallest, that a run may hold
+
+
 def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]:
     """The gains of each sequence of a finished run. The list is empty if it was trained without any."""
     path = run_dir / GAINS
     if not path.exists() and not path.is_symlink():
         return []
     with expect_whole(path, "train again"):
-        return list(read_tensors(path)["gains"].float().split(list(lengths)))
+        gains = read_tensors(path)["gains"]
+        if gains.dtype.itemsize < 4 or not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
+            raise ValueError(f"a gain is not a number from {1 / _MOST:g} to {_MOST:g}")
+        return list(gains.float().split(list(lengths)))
 
 
 def _brightness(sequences: Items[Sequence], frames: Items[Frame], timesteps: int) -> Float[np.ndarray, " t"]:
