@@ -85,8 +85,8 @@ OF_A_RUN = {
     "study": "make {toy} --out {out}/study.html --seconds 0.2 --side 64 --runs toy third",
     "render": "{toy} --run toy --out {out}/still.png",
     "drive": "{toy} --run toy --by {toy} --out {out}/driven.mp4", "export": "{demo} --out {out}/me.html",
-    "import": "{exported} --out {out}/imported", "face-models": "--json",
-    "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
+    "export-dataset": "{toy} --out {out}/data --format insta", "import": "{exported} --out {out}/imported",
+    "face-models": "--json", "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
 }  # fmt: skip
 """Lines of every command but two: `demo` makes the subject, and `view` has a test of its own."""
 _FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
