@@ -75,7 +75,7 @@ demo: setup
 test: setup web-packages chromium
 	MIEN_THREADS=1 $(BIN)/pytest -n auto -m "not long"
 
-# The same, and the table of docs/tests.md at its end: where the seconds go.
+# The same, and a table at its end: where the seconds go.
 test-times: setup web-packages chromium
 	mkdir -p out && rm -f out/test_times.jsonl
 	MIEN_TEST_TIMES=$(abspath out/test_times.jsonl) PYTHONPATH=tests MIEN_THREADS=1 $(BIN)/pytest -p times -n auto -m "not long"

@@ -2,7 +2,7 @@
 
     PYTHONPATH=tests python benchmarks/batch_trial.py ENGINE FOLDER [--kills 20]
 
-It prints what docs/scale.md quotes: seconds, the driver's memory, the time of `mien batch status`, rows that began or
+It prints seconds, the driver's memory, the time of `mien batch status`, rows that began or
 ended more than once, rows that ran twice at the same time, and rows that were lost. With `--kills`, processes are
 killed at random while it runs: the driver, workers, and tasks or nodes of the engine. Stub rows run in the process that
 the engine starts (the driver's own on `local`), since 10,000 starts of Python would take hours.

@@ -177,7 +177,7 @@ def scores(cases: list[Spoken]) -> tuple[float, int, int]:
 
 
 def rows() -> Iterator[str]:
-    """The table of docs/using.md, a row at a time."""
+    """The table of all methods, a row at a time."""
     speaker = Speaker()
     yield "| sentences | voice of espeak-ng | r of the jaw | lips shut at p, b, m |\n|---|---|---|---|"
     for kind, sentences in SENTENCES.items():

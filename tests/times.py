@@ -1,7 +1,7 @@
 """Where the time of the tests goes, by theme: seconds, those that wait for other processes, and how many are started.
 
 As a plugin of pytest it appends a line of json for each test to the file that MIEN_TEST_TIMES names. As a program it
-prints the table of docs/tests.md. `make test-times` does both."""
+prints the table. `make test-times` does both."""
 
 import json
 import os
