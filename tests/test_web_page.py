@@ -12,7 +12,7 @@ import pytest
 import web_case as web
 from mien import runtime
 from mien.cli import main
-from mien.formats.page import POSTER, PageOptions, write_packed, write_page
+from mien.formats.page import POSTER, PageOptions, check_page, write_packed, write_page
 from needs import NO_WEBGPU
 from refusals import refuses
 from test_web import REST, SHOW, SLIDE, WHITE, points, posing, skinned_head
@@ -198,7 +198,7 @@ def test_a_page_with_an_address_has_a_poster(tmp_path: Path, portable: runtime.P
     assert "og:" not in (tmp_path / "b.html").read_text()
     assert not (tmp_path / "b.jpg").exists()
     for address in ("me.html", "javascript:alert(1)", "https://"):
-        refuses("is no address; give one such as", PageOptions(address=address).check, tmp_path)
+        refuses("is no address; give one such as", check_page, tmp_path, PageOptions(address=address))
     runtime.write_portable(tmp_path / "c.mien", replace(drawn_head(10), filmed=None))
     given = ["--title", "Ada", "--address", "https://example.org/c.html"]
     assert main(["export", str(tmp_path / "c.mien"), "--out", str(tmp_path / "c.html"), *given]) == 0
