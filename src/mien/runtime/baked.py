@@ -288,7 +288,7 @@ class PortableAvatar:
     """What training saw of the face. None if it is not known."""
     confidence: Float32[np.ndarray, " f"] | None = None
     """How often and how squarely the training pictures show each triangle of the face model, from 0 (never, so it is
-    made up) to 1. With w the sum, over the frames, of c^2 s(5 c - 0.5) v m, it is s(w), and 0 if w is at most 0.001.
+    completed) to 1. With w the sum, over the frames, of c^2 s(5 c - 0.5) v m, it is s(w), and 0 if w is at most 0.001.
 
     c is the cosine between the triangle's normal and the direction to the camera, at least 0; v the share that the
     mesh's own depth leaves visible, m the share in the scoring mask, and s(x) = x^2 (3 - 2 x) with x limited to 0..1

@@ -1,6 +1,6 @@
-"""How far hair stands out from a face model, measured on the outlines of the mattes, and long hair behind a head.
+"""How far hair is off a face model, measured on the outlines of the mattes, and long hair behind a head.
 
-The front camera sees hair beside jaw and neck, as far as it stands out from the outline, and nothing of the back. A
+The front camera sees hair beside jaw and neck, as far as it is beyond the outline, and nothing of the back. A
 head whose hair ended at the hairline of the nape would lack much of its outline from the side. Long hair falls from
 where the head is widest, so behind the ears it is as far from the upright axis as it is above, down to the level to
 which it hangs at the sides.
@@ -81,7 +81,7 @@ def hair_height(footage: Footage) -> Float[Tensor, " f"]:
 
 @torch.no_grad()
 def hanging_hair(footage: Footage) -> Float[Tensor, " f"]:
-    """Return how far the outline stands out beside skin and neck, in metres, 0..0.08; 0 on the scalp.
+    """Return how far the outline is beyond the mesh beside skin and neck, in metres, 0..0.08; 0 on the scalp.
 
     Long hair hangs off the scalp, beside cheeks and neck, and rings hang from ears. Unlike `hair_height`, nothing is
     concluded about triangles that are far from any outline.

@@ -3,7 +3,7 @@
 A tracked skull can stand out beyond the hair, ears can hang lower than the person's, and a neck can be wider. What no
 picture shows of them is filled at the mesh, so every picture contradicts it there, and nothing takes it away. Each
 vertex that lies outside of the matte is therefore drawn to it, in all frames together, by smooth offsets of the mesh.
-What lies inside stays where tracking put it: hair and hanging things stand out beyond a mesh that is right. Only the
+What lies inside stays where tracking put it: hair and earrings are beyond a mesh that is right. Only the
 scalp moves as a whole, because pictures from the front show its highest points alone, and these would be cut flat.
 """
 

@@ -1,6 +1,6 @@
 """Sides of the head that no training picture shows: a closed surface in completed colours from the first step on.
 
-What no picture shows must not help to explain pictures. Gaussians on such triangles are made up: opaque and flat, at
+What no picture shows must not help to explain pictures. Gaussians on such triangles are completed: opaque and flat, at
 the height of hair, in completed colours. Training changes only their height along the normal, where pictures clearly
 contradict it, as where they stand out beyond the outline. Triangles in a band beside those that are seen are trained,
 because the hair above them is on the outline.
@@ -32,12 +32,12 @@ from mien.training.whole_head.completion import Surface, complete_colors, vertex
 from mien.training.whole_head.hair_height import back_hair, hair_height, hanging_hair
 
 UNSEEN_CONFIDENCE = 0.02
-"""Confidence below which a triangle is made up. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90
+"""Confidence below which a triangle is completed. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90
 degrees; 0.02 was chosen between them (11-23)."""
 OUTLINE_BAND = 0.025
 """Distance in metres from what pictures show up to which unseen triangles are trained. Hair above them is on the
 outline. Measured (1,600 steps): without a band, the heads of d3, d9 and wojtek have 0.7, 0.3 and 0.1 dB less; with 50
-mm, or with no fills at all, d3 has 0.1 dB more (log, 11-26)."""
+mm, or with no completed Gaussians, d3 has 0.1 dB more (log, 11-26)."""
 _HEIGHT_FRAMES = 48
 """Largest number of frames in which the mesh is drawn as high as its hair, to find what they show of hair."""
 _MOUTH_FRAMES = 240  # number of frames in which the inside of the mouth is looked for
@@ -55,7 +55,7 @@ _FILL_CONTRADICTION = 1e-6
 through every avatar, so smaller gradients reach what is hidden. Chosen instead of 3e-6 together with other changes
 (11-23) alone."""
 _FILL_ALPHA_WEIGHT = 1.0
-"""Least weight of the loss of alpha. Without it, white Gaussians hide fills that stand out beyond the outline, and
+"""Least weight of the loss of alpha. Without it, white Gaussians hide completed Gaussians beyond the outline, and
 white shines through hair. Measured on wojtek's head, 12,000 steps over white: 0.2, 0.5 and 1 have 30.3 to 30.4 dB over
 white, and 26.4, 27.9 and 28.7 over dark blue. Growth at half the gradient, used with 1 alone, is 0.3 of it at most
 (log, 11-28)."""
@@ -121,7 +121,7 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
 
 
 def spare_fills(surface: BoundSurface, density: DensityControl, unseen: Unseen) -> DensityControl:
-    """A density control by which closed surfaces keep their opacity at resets, and fills do not count to its limit."""
+    """A density control whose resets spare closed surfaces, and whose limit does not count completed Gaussians."""
     closed, filled_in = unseen.prior.closed, unseen.filled_in(surface)
     if closed is None or not isinstance(density, GradientDensity):
         return density
