@@ -170,7 +170,7 @@ class Compare:
 
     The table has quality (head, eyes, mouth, whole frame, unseen views where there are any), Gaussians, training time,
     time a frame, and size on disk. A stopped command continues where it was. The runs are in the workspaces, named
-    compare-METHOD-BUDGET, for `mien evaluate --compare` and `mien study make`.
+    compare-METHOD-BUDGET, for `mien evaluate compare` and `mien study make`.
     """
 
     workspaces: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[DIR [DIR ...]]")] = ()

@@ -55,7 +55,8 @@ class _Film:
 class Film(_Neutral, _Film, _Drive):
     """Make an avatar follow somebody else: a video, a camera, a sequence, or a recording.
 
-    Without --out, a viewer in the browser plays the motion at once; --neutral, --port and --capture.* are its options.
+    These are the options of a film, which --out names. Without --out, a viewer in the browser plays the motion at once;
+    --neutral, --port and --capture.* are its options.
 
     With --by camera, the avatar follows you in a viewer, and --out records it as .mp4; see mien drive --by camera
     --help.
