@@ -109,8 +109,8 @@ class PerceptualLoss:
     blocks: Annotated[int, Range(1, 3)] = 2
     """Number of blocks of the network, from fine to coarse features. Each doubles the cost, or more."""
     region: Literal["parts", "person"] = "parts"
-    """What a step compares: a crop drawn at random around the eyes, the mouth, or anywhere in the scoring mask's box
-    (parts), or all of that box (person), which takes many times as long."""
+    """Part of the picture that a step compares: a crop drawn at random around the eyes, the mouth, or anywhere in the
+    scoring mask's box (parts), or all of that box (person), which takes many times as long."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether a step of a run of `steps` has this loss."""
@@ -306,7 +306,7 @@ FREE_POINTS_PAPER_FEATURES = {"weight": 0.1, "start": 0.0, "every": 1, "crop": 2
 
 
 def free_points_paper(epochs: int) -> dict[str, Any]:
-    """What the presets `paper` of these methods share, over a number of epochs."""
+    """Return the settings that the presets `paper` of these methods share, over a number of epochs."""
     return {
         "face_tuning": {
             "expression": 5e-4,

@@ -36,7 +36,7 @@ class Run:
     out: Path
     """Folder of the batch, new or existing."""
     on: Literal["local", "slurm", "ray"] = "local"
-    """What runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
+    """The engine that runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
     shard: str = ""
     """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
     retry: int = 2

@@ -120,7 +120,8 @@ class Follow(_Film, _Drive):
     out: Path | None = None
     """An .mp4 that records it."""
     camera_format: CameraFormat | None = None
-    """What reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the platform's."""
+    """The interface that reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the
+    platform's."""
     port: int = 0
     """Port of the viewer, from 1 to 65535. 0 means a free one."""
 
@@ -147,7 +148,7 @@ class Follow(_Film, _Drive):
 
 
 def task_of(arguments: Sequence[str]) -> type:
-    """What drives the avatar, and where that is shown, decide which options there are."""
+    """Return the class of options by what drives the avatar, and where that is shown."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--by", nargs="?")
     parser.add_argument("--out", nargs="?")

@@ -93,7 +93,7 @@ def with_defaults(command: type, arguments: Sequence[str]) -> Any:
 
 
 def in_one_line(box: str) -> str:
-    """What tyro's box of a complaint says, without the descriptions of options."""
+    """Return the text of tyro's box of a complaint, without the descriptions of options."""
     # If the terminal has no Unicode, the box is a title, a line of dashes, and the content indented by two spaces.
     lines, parts = box.splitlines()[1 if "╭" in box else 2 :], [""]
     for line in lines:

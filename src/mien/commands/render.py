@@ -29,7 +29,7 @@ _MAX_STRENGTH = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class _Look:
-    """What of an avatar is shown, and from where."""
+    """Options that `render` and `render sheet` share: the avatar, its face, and the view."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Workspace folder. Without sheets also a .mien file, which is drawn without torch."""

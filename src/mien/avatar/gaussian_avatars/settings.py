@@ -47,7 +47,7 @@ class GaussianAvatarsConfig(MethodConfig):
     """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say, such as
     wrinkles. 0 is the paper's method."""
     expression_changes: tuple[ChangeKind, ...] = ("offset",)
-    """What changes linearly with these activations: a Gaussian's colour, opacity, or place (offset)."""
+    """Attributes that change linearly with these activations: a Gaussian's colour, opacity, or place (offset)."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which holds back what pictures do not need."""
     appearance: Literal["static", "features"] = "features"

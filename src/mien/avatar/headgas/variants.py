@@ -29,7 +29,7 @@ Splatting."""
 
 
 class Changes(NamedTuple):
-    """What depends on the expression, at one timestep."""
+    """Changes of the Gaussians with the expression, at one timestep."""
 
     colors: Float[Tensor, "n c"]
     """Spherical harmonics, all coefficients of all channels."""
@@ -40,7 +40,7 @@ class Changes(NamedTuple):
 
 @dataclass(frozen=True)
 class Ablation:
-    """What a variant does in the place of the method."""
+    """Functions of a variant that take the place of the method's."""
 
     tensors: Callable[[Float[Tensor, "n 3"], int, HeadGasConfig], dict[str, Tensor]]
     """(centres, number of directions, settings) -> trained tensors beside the shapes of Gaussians."""
