@@ -81,13 +81,14 @@ test-times: setup web-packages chromium
 	MIEN_TEST_TIMES=$(abspath out/test_times.jsonl) PYTHONPATH=tests MIEN_THREADS=1 $(BIN)/pytest -p times -n auto -m "not long"
 	$(BIN)/python tests/times.py out/test_times.jsonl
 
-# Campaigns, which take hours. SAMPLE=1 runs a sample of each, as CI does; its seed is the date unless SEED says otherwise.
+# Campaigns, which take hours. SAMPLE=1 runs a sample of each, as CI does. Its seed is the date of the commit, so that the same
+# commit always runs the same sample; SEED says another.
 SAMPLE ?=
-SEED ?= $(if $(SAMPLE),$(shell date -u +%Y%m%d),1)
+SEED ?= $(if $(SAMPLE),$(or $(shell git log -1 --format=%cd --date=format:%Y%m%d 2>/dev/null),1),1)
 test-long: setup web-packages chromium batch-engines
 	@echo "test-long: one again with SEED=$(SEED)$(if $(SAMPLE), SAMPLE=$(SAMPLE))"
 	$(MAKE) sanitize
-	$(MAKE) fuzz SEED=$(SEED) $(if $(SAMPLE),MINUTES=1 CALLS=3000)
+	$(MAKE) fuzz SEED=$(SEED) $(if $(SAMPLE),MINUTES= CALLS=3000)
 	$(MAKE) kills SEED=$(SEED) $(if $(SAMPLE),KILLS=4)
 	$(MAKE) mutate SEED=$(SEED) $(if $(SAMPLE),MUTATIONS=4)
 	$(MAKE) test-exact
@@ -124,10 +125,12 @@ fuzz-native: setup
 	$(BIN)/ninja --quiet -C $(SANITIZED)
 	PYTHONPATH=tests $(BIN)/python -m fuzzing.native_calls $(SANITIZED)/native --calls $(CALLS) --seed $(SEED)
 
-# Faults in files of every format and odd command lines, for MINUTES, native calls; findings go to out/fuzz/findings.jsonl.
+# Faults in files of every format and odd command lines, native calls; findings go to out/fuzz/findings.jsonl. It goes on with further
+# seeds for MINUTES, or ends after CASES.
 MINUTES ?= 10
+CASES ?= 5000
 fuzz: setup
-	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases 5000 --minutes $(MINUTES) --workers 2 \
+	PYTHONPATH=tests $(BIN)/python -m fuzzing --self-check --seed $(SEED) --cases $(CASES) $(MINUTES:%=--minutes %) --workers 2 \
 	  --findings out/fuzz/findings.jsonl
 	$(MAKE) fuzz-native
 

@@ -194,7 +194,9 @@ def read_gains(run_dir: Path, lengths: Items[int]) -> list[Float[Tensor, "t 3"]]
         return []
     with expect_whole(path, "train again"):
         gains = read_tensors(path)["gains"]
-        if gains.dtype.itemsize < 4 or not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
+        if gains.shape != (sum(lengths), 3) or gains.dtype.itemsize < 4:
+            raise ValueError(f"the gains have the shape {tuple(gains.shape)} and the type {gains.dtype}")
+        if not bool(((gains > 1 / _MOST) & (gains < _MOST)).all()):
             raise ValueError(f"a gain is not a number from {1 / _MOST:g} to {_MOST:g}")
         return list(gains.float().split(list(lengths)))
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from mien.disk.config import Range, check_ranges
+from mien.disk.config import Range, check_ranges, decode
 from mien.disk.files import expect_whole, read_json, write_json
 from mien.disk.inside import listed
 from mien.disk.reading import parse_json, read_bytes
@@ -111,9 +111,8 @@ def write_key(path: Path, key: StudyKey) -> None:
 def read_key(path: Path) -> StudyKey:
     """Read the key of a study."""
     content = read_json(path, _KEY, VERSION, "`mien study make`", _KEY_REMEDY)
-    with expect_whole(path, _KEY_REMEDY):
-        clips = tuple(KeyClip(**entry) for entry in content["clips"])
-        return StudyKey(content["study"], content["seed"], tuple(content["runs"]), clips)
+    own = {name: value for name, value in content.items() if name not in ("format", "version")}
+    return decode(StudyKey, own, str(path), _KEY_REMEDY)
 
 
 def read_answers(path: Path, key: StudyKey) -> Answers:
