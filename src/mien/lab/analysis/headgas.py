@@ -18,7 +18,6 @@ from mien.evaluation.experiment import avatar_image, target_image
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, world_means
-from mien.lab.analysis.context import Context, Run
 from mien.lab.analysis.measuring import (
     draw_avatar,
     draw_mesh,
@@ -32,6 +31,7 @@ from mien.lab.analysis.measuring import (
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
+from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.machine.terminal import counted
@@ -76,22 +76,13 @@ class Trained:
 
 
 def trained_range(context: Context) -> Trained:
-    """The range of the run's training, from its avatar, or from its sequences if the avatar does not hold it."""
-    avatar, filmed = context.avatar, context.avatar.filmed
-    at_rest = float(_yaws(avatar.subject, context.camera)[0])
-    if filmed is not None:
-        low, high = (float(value) for value in filmed.head_angles[0])
-        count = avatar.subject.expression.shape[1]
-        return Trained(torch.from_numpy(filmed.highest[:count].copy()), (low, high), at_rest)
-    trackings = [one.tracking for one in context.sequences]
-    yaws = np.concatenate([_yaws(one.face, camera) for one in trackings for camera in one.cameras])
-    highest = torch.cat([one.face.expression for one in trackings]).amax(0)
-    return Trained(highest, (float(yaws.min()), float(yaws.max())), at_rest)
-
-
-def _yaws(face: FaceParams, camera: Camera) -> np.ndarray:
-    parts = (face.head_rotation, face.head_translation, camera.position)
-    return head_angles(*(part.detach().cpu().numpy() for part in parts))[:, 0]
+    """The range of the run's training."""
+    subject, filmed = context.avatar.subject, context.avatar.filmed
+    assert filmed is not None, "only avatars of other programs have no range, and none of them is of this method"
+    low, high = (float(value) for value in filmed.head_angles[0])
+    parts = (subject.head_rotation, subject.head_translation, context.camera.position)
+    at_rest = head_angles(*(part.detach().cpu().numpy() for part in parts))[0, 0]
+    return Trained(torch.from_numpy(filmed.highest[: subject.expression.shape[1]].copy()), (low, high), float(at_rest))
 
 
 def with_expression(face: FaceParams, index: int, value: float) -> FaceParams:
