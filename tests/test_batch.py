@@ -56,7 +56,7 @@ def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(tmp_path: Path, mo
     (tmp_path / "squeue").chmod(0o755)
     queued.write_text("77_0 RUNNING\n")
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr("mien.batch.slurm.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("mien.batch.engines.POLL_SECONDS", 0.05)
     (batch.root / "slurm").mkdir()
     (batch.root / "slurm" / "jobs.txt").write_text("77")
 
@@ -193,7 +193,7 @@ def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path, monkeypa
 
 
 def test_memory_is_counted_before_rows_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("mien.batch.local.free_memory_mb", lambda: 1000.0)
+    monkeypatch.setattr("mien.batch.engines.free_memory_mb", lambda: 1000.0)
     rows = [stub_row(f"big{index}", ("sleep", "0.3"), memory_mb=700.0) for index in range(2)]
     rows.append(stub_row("huge", ("sleep", "0.1"), memory_mb=5000.0))
     assert set(run_stubs(Batch(tmp_path), rows, jobs=4).values()) == {"done"}
@@ -258,7 +258,7 @@ def test_no_link_in_a_batch_is_followed(tmp_path: Path, place: str) -> None:
     way = ways.get(place.split("/")[0], lambda name: batch.place("thumbs", f"{name}.jpg"))
     refuses("is a link, and links", way, "ann")
     if place.startswith("logs"):
-        refuses("is a link, and links", attempt, batch.root, stub_row("ann"), PROGRAM)
+        refuses("is a link, and links", attempt, batch.root, PROGRAM, None, stub_row("ann"))
     assert outside.read_text() == "mine" if "." in place else not any(outside.iterdir())
 
 

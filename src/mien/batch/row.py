@@ -11,7 +11,6 @@ import shlex
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -32,8 +31,6 @@ from mien.machine.terminal import printable, tell
 
 Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
 """Runs the steps of a row, and returns the figures of its runs and the seconds of its stages."""
-PROGRAM = (sys.executable, "-m", "mien.commands.batch_row")
-"""The command of a row's process."""
 EXIT_BUSY = 75
 """Exit code of a row's process if another process holds the row."""
 _waited_for: dict[subprocess.Popen[bytes], bool] = {}
@@ -60,14 +57,11 @@ def run_row(batch: Batch, row: Row, do: Do, patience: float = 0.0) -> State | No
             time.sleep(0.5)
 
 
-def _claimed(batch: Batch, row: Row, do: Do) -> State:
-    before = batch.read_state(row.name)
-    if before is not None and before.status == "done" and before.fingerprint == row.fingerprint:
-        return before
-    same = before is not None and before.fingerprint == row.fingerprint
-    tries = before.tries + 1 if before is not None and same else 1
+def _claimed(batch: Batch, row: Row, do: Do) -> State | None:
+    if batch.is_done(row):
+        return batch.read_state(row.name)
     here = f"{socket.gethostname()}, process {os.getpid()}"
-    state = State(row.name, "running", row.fingerprint, tries, here, time.time(), mien=mien.__version__)
+    state = State(row.name, "running", row.fingerprint, batch.tries(row) + 1, here, time.time(), mien=mien.__version__)
     batch.write_state(state)
     try:
         runs, stages = do(batch, row)
@@ -79,7 +73,7 @@ def _claimed(batch: Batch, row: Row, do: Do) -> State:
     return state
 
 
-def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> State | None:
+def attempt(root: Path, program: Sequence[str], threads: int | None, row: Row) -> State | None:
     """Run a row in a process of its own and wait for it. Return its state.
 
     None if another process holds the row, or if `stop_attempts` stopped it, which then counts as interrupted.
@@ -138,11 +132,10 @@ def _concluded(batch: Batch, row: Row, code: int, started: float, printed: int) 
         state = batch.read_state(row.name)
         if told(state):
             return state
-        before = state if state is not None and state.fingerprint == row.fingerprint else None
-        if before is None or before.began < started:  # the process had not even claimed the row
-            before = State(row.name, "failed", row.fingerprint, before.tries + 1 if before else 1, began=started)
-        seconds = round(time.time() - before.began, 2)
-        failed = replace(before, status="failed", seconds=seconds, error=_why(batch, row, code, printed))
+        if state is None or state.fingerprint != row.fingerprint or state.began < started:  # it had not even claimed it
+            state = State(row.name, "failed", row.fingerprint, batch.tries(row) + 1, began=started)
+        seconds = round(time.time() - state.began, 2)
+        failed = replace(state, status="failed", seconds=seconds, error=_why(batch, row, code, printed))
         with suppress(CannotWriteError):  # the disk is full; the engine tells of the state all the same
             batch.write_state(failed)
         return failed

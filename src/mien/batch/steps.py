@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.batch.plan import WORKSPACE, Batch, Row
-from mien.batch.row import Do, RowFailedError, last_error
+from mien.batch.row import RowFailedError, last_error
 from mien.batch.store import fetched
 from mien.disk.files import write_atomically
 from mien.disk.workspace import Workspace
@@ -21,12 +21,8 @@ _VIEWS, _SIDE = 12, 160
 """Number of pictures in a thumbnail, and their sides in pixels."""
 
 
-def do_with(main: Main) -> Do:
-    """Return what runs the steps of a row with `main`."""
-    return partial(_do, main)
-
-
-def _do(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
+def do_steps(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
+    """Run the steps of a row with `main`, as `mien.batch.row.Do` does."""
     workspace = batch.workspace(row.name)
     stages: defaultdict[str, float] = defaultdict(float)
     for step in row.steps:
