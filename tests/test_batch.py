@@ -27,7 +27,7 @@ from mien.commands.batch_table import read_table
 from mien.disk.files import write_atomically
 from mien.disk.locks import hold
 from other_process import Holder
-from refusals import complaint, refuses
+from refusals import refuses
 
 
 def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
@@ -277,15 +277,20 @@ def hostile(**given: object) -> str:
     hostile(began=1e308, seconds=1e308, status="running"),
     hostile(seconds=float("nan")),
     hostile(mien=["0"]),
+    hostile(version=99),
+    hostile(stages={"a": "x"}),
+    hostile(status="bogus"),
+    "{",
 ])  # fmt: skip
 def test_hostile_states_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str) -> None:
     batch = Batch(tmp_path)
-    batch.write_plan([Row("ann", ())])
-    batch.state_file("ann").parent.mkdir()
+    batch.write_plan([Row("ann", ()), Row("bob", ())])
+    batch.write_state(State("bob", "done", "", runs=({"run": "a", "method": "a", "psnr": 31.0},)))
     batch.state_file("ann").write_text(content)
     assert main(["batch", "status", str(tmp_path)]) == 0
     assert f"ann: failed, try 1: {batch.state_file('ann')}: " in capsys.readouterr().out
-    assert "no row is done yet" in complaint(capsys, "batch", "table", str(tmp_path))
+    assert main(["batch", "table", str(tmp_path), "--columns", "psnr"]) == 0
+    assert "| a | 1 | 31.00 |" in capsys.readouterr().out
 
 
 def test_formulas_in_headings_are_defused(tmp_path: Path) -> None:

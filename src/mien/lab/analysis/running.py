@@ -193,17 +193,14 @@ def run_analysis(
                 write_json(record, _FORMAT, _VERSION, content)
             for finding in content["parts"][part.name]["findings"]:
                 say(f"{part.name}: {finding}")
+        shown = [one for one in analysis.parts if one.name in content["parts"]]
         page = render(
             "lab/analysis/templates/analysis.html",
             title=f"{run_dir.name} · {analysis.method}",
             paper=analysis.paper,
             version=mien.__version__,
             command=shlex.join(["mien", *sys.argv[1:]]),
-            sections=[
-                section_html(one.title, content["parts"][one.name], folder)
-                for one in analysis.parts
-                if one.name in content["parts"]
-            ],
+            sections=[section_html(one.title, content["parts"][one.name], folder) for one in shown],
         )
         write_json(record, _FORMAT, _VERSION, content)
         write_atomically(folder / "analysis.html", lambda aside: aside.write_text(page, encoding="utf-8"))

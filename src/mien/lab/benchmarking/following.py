@@ -37,7 +37,9 @@ def following(
     Each run of `busy` timesteps is an event, to which `around` timesteps before and after belong. Events with tracked
     values that are not finite are skipped.
     """
-    windows = _windows(busy, around)
+    wide = np.convolve(busy, np.ones(2 * around + 1), mode="same") > 0  # windows that overlap are one
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
+    windows = [slice(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
     parts = [part for part in windows if np.isfinite(tracked[part]).all() and part.stop - part.start > 2]
     if not parts:
         return None
@@ -50,13 +52,6 @@ def following(
 def _around(fps: float) -> int:
     """Timesteps before and after an event that belong to it: 0.3 s."""
     return max(round(0.3 * fps), 2)
-
-
-def _windows(busy: Bool[np.ndarray, " t"], around: int) -> list[slice]:
-    """Return one window per event, longer by `around` at both ends. Overlapping windows are merged."""
-    wide = np.convolve(busy, np.ones(2 * around + 1), mode="same") > 0
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
-    return [slice(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _products(

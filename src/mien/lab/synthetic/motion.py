@@ -58,7 +58,7 @@ def _lay_out(recipe: SyntheticRecipe) -> tuple[_Span, ...]:
 
 def _moving_clock(times: np.ndarray, spans: tuple[_Span, ...]) -> np.ndarray:
     """Return the seconds of motion so far: a clock that stops while the script is still."""
-    speed = 1 - sum((span.window(times) for span in spans if span.kind == "still"), np.zeros_like(times))
+    speed = 1 - _share_of("still", times, spans)
     step = float(times[1] - times[0]) if len(times) > 1 else 0.0
     return np.concatenate([[0.0], np.cumsum(speed[:-1]) * step])
 
@@ -108,6 +108,11 @@ def _add(tracks: _Tracks, shape: Mapping[str, float], weight: np.ndarray, factor
         tracks[name] = tracks.get(name, 0) + value * weight * (1 if factors is None else factors[name])
 
 
+def _bump(times: np.ndarray, start: float, high: float, down: float, end: float) -> np.ndarray:
+    """Return a rise from `start` to `high` and a fall from `down` to `end`, 0..1."""
+    return smoothstep(start, high, times) - smoothstep(down, end, times)
+
+
 def _add_speech(random: np.random.Generator, times: np.ndarray, span: _Span, tracks: _Tracks) -> None:
     """Add phrases of one to two seconds: visemes every 0.12 to 0.24 s that blend into each other, then a pause."""
     names = [name for name in PEOPLE["visemes"] if name != "rest"]
@@ -139,9 +144,7 @@ def _add_gestures(random: np.random.Generator, times: np.ndarray, span: _Span, t
         if not order:
             order = [*random.permutation([*PEOPLE["gestures"], "smile"])]
         rise, hold, fall = random.uniform(0.25, 0.45), random.uniform(0.3, 0.9), random.uniform(0.35, 0.6)
-        weight = smoothstep(clock, clock + rise, times) - smoothstep(
-            clock + rise + hold, clock + rise + hold + fall, times
-        )
+        weight = _bump(times, clock, clock + rise, clock + rise + hold, clock + rise + hold + fall)
         _add(tracks, PEOPLE["gestures"][order.pop()], random.uniform(0.7, 1.0) * weight)
         clock += rise + hold + 0.6 * fall + random.uniform(0.0, 0.5)
 
@@ -154,7 +157,7 @@ def _add_posed(random: np.random.Generator, times: np.ndarray, span: _Span, trac
         order = order or [*random.permutation([*PEOPLE["posed"]])]
         rise, hold, fall = random.uniform(0.3, 0.5), random.uniform(0.4, 0.9), random.uniform(0.3, 0.5)
         down = clock + rise + hold
-        weight = smoothstep(clock, clock + rise, times) - smoothstep(down, down + fall, times)
+        weight = _bump(times, clock, clock + rise, down, down + fall)
         _add(tracks, PEOPLE["posed"][order.pop()], random.uniform(0.8, 1.0) * weight)
         clock = down + fall + random.uniform(0.0, 0.25)
 
@@ -166,10 +169,8 @@ def _add_blinks(random: np.random.Generator, times: np.ndarray, spans: tuple[_Sp
     while clock < times[-1]:
         length = random.uniform(0.18, 0.3)
         if not any(span.kind == "still" and span.start < clock + length and clock < span.end for span in spans):
-            weight = smoothstep(clock, clock + 0.35 * length, times) - smoothstep(
-                clock + 0.45 * length, clock + length, times
-            )
-            closed = np.maximum(closed, weight)
+            bump = _bump(times, clock, clock + 0.35 * length, clock + 0.45 * length, clock + length)
+            closed = np.maximum(closed, bump)
         clock += random.uniform(1.2, 3.5)
     tracks["eyeBlink"] = np.maximum(tracks.get("eyeBlink", 0), closed)
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from mien.lab.synthetic.arithmetic import along, smoothstep, unit
@@ -11,7 +10,6 @@ from mien.lab.synthetic.hair import Strands
 from mien.lab.synthetic.light import Lighting, irradiance_polynomial
 from mien.machine import exact
 from mien.machine.exact import dot
-from mien.render.mesh import sample_texture
 
 _MIN_HIGHLIGHT = 0.2
 """Weaker lamps contribute only diffuse light."""
@@ -225,8 +223,3 @@ def shade_lens(
     grazing = 1 - np.abs(dot(normals, views))[:, None]
     room = np.array([0.010, 0.013, 0.014], np.float32) * (1 + 8 * grazing**3)
     return room + shade_highlights(normals, views, light, ((0.2, 60.0),))
-
-
-def look_up(channels: Float[np.ndarray, "s s c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:
-    """Sample a texture bilinearly."""
-    return sample_texture(torch.from_numpy(channels), torch.from_numpy(uv)[None])[0].numpy()

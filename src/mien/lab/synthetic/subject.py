@@ -84,7 +84,11 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     hair_color = _color(random, "hair")
     collar, size = _collar(anatomy)
     eyes = tuple(_eye(anatomy, side) for side in SIDES)
-    scalp = _scalp_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
+    scalp = None
+    if recipe.hair == "long":
+        scalp = grow_long_hair(anatomy, hair_color, float(collar[1]), seed)
+    elif recipe.hair == "short":
+        scalp = grow_short_hair(anatomy, hair_color, seed)
     hair: list[Hair] = [] if scalp is None else [scalp]
     if recipe.brows_and_lashes:
         hair.append(grow_brows(anatomy, 0.7 * hair_color, seed))
@@ -140,14 +144,6 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
         R_world_head=R,
         viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
     )
-
-
-def _scalp_hair(
-    anatomy: Anatomy, recipe: SyntheticRecipe, color: Float[np.ndarray, " 3"], collar: float, seed: int
-) -> Strands | DrapedStrands | None:
-    if recipe.hair == "long":
-        return grow_long_hair(anatomy, color, collar, seed)
-    return grow_short_hair(anatomy, color, seed) if recipe.hair == "short" else None
 
 
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:

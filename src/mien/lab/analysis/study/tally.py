@@ -41,7 +41,12 @@ def tally_content(key: StudyKey, answers: Sequence[Answers]) -> dict[str, Any]:
                 "sequence": clip.sequence,
                 "camera_id": clip.camera_id,
                 "timesteps": [clip.first, clip.first + clip.timesteps - 1],
-                **{question: _counts(key, question, [one.clips[index] for one in answers]) for question in QUESTIONS},
+                **{
+                    question: {
+                        run: sum(one.clips[index].choices[question] == run for one in answers) for run in key.runs
+                    }
+                    for question in QUESTIONS
+                },
             }
             for index, clip in enumerate(key.clips)
         ],
@@ -57,10 +62,6 @@ def _entry(run: str, question: str, answers: Sequence[Answers]) -> dict[str, Any
         "low": round(100 * low, 2),
         "high": round(100 * high, 2),
     }
-
-
-def _counts(key: StudyKey, question: str, answers: Sequence[Any]) -> dict[str, int]:
-    return {run: sum(one.choices[question] == run for one in answers) for run in key.runs}
 
 
 def _positions(question: str, answers: Sequence[Answers]) -> dict[str, float]:
