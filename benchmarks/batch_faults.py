@@ -21,8 +21,7 @@ from typing import Any
 from batch_stub import note, watched
 from mien.batch.plan import Batch, Row
 from mien.batch.progress import batch_progress, progress_text
-from mien.batch.row import row_process
-from mien.batch.steps import do_steps
+from mien.batch.row import do_steps, row_process
 from mien.cli import main as mien
 from mien.disk.files import read_json
 

@@ -20,8 +20,7 @@ from mien.batch.drive import shard_of
 from mien.batch.plan import Batch, Row, State
 from mien.batch.progress import batch_progress, progress_text
 from mien.batch.results import write_results
-from mien.batch.row import attempt, run_row
-from mien.batch.steps import write_strip
+from mien.batch.row import attempt, run_row, write_strip
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.disk.files import write_atomically

@@ -13,7 +13,7 @@ from PIL import Image
 from batch_stub import PROGRAM
 from mien.batch.plan import Batch, Row, State
 from mien.batch.results import latex_table, markdown_table, means_by, write_results, write_wall
-from mien.batch.steps import write_strip
+from mien.batch.row import write_strip
 from mien.cli import main
 from mien.commands import batch as batch_command
 from mien.commands.batch_table import read_table

@@ -19,8 +19,7 @@ from dataset_writers import BENCHMARK_SCALE, write_benchmark
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.avatar.settings import FaceTuning
 from mien.batch.plan import Batch
-from mien.batch.row import run_row
-from mien.batch.steps import do_steps
+from mien.batch.row import do_steps, run_row
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.datasets import overlay, pictures, sequences

@@ -1,4 +1,4 @@
-"""One row: the claim on it, its steps, its state; and the process in which it runs.
+"""One row: the claim on it, its steps, its state, its figures; and the process in which it runs.
 
 `run_row` runs in a process of its own, so that a row that needs too much memory fails alone. That process holds the
 row's lock and runs the steps itself: whatever kills it frees the lock and leaves nothing behind. `attempt` starts it
@@ -13,18 +13,24 @@ import socket
 import subprocess
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import mien
 from mien.batch.plan import WORKSPACE, Batch, Row, State
+from mien.batch.store import fetched
 from mien.disk.config import decode
+from mien.disk.files import write_atomically
 from mien.disk.inside import open_to_append, open_to_read
 from mien.disk.locks import BeingWrittenError, hold
+from mien.disk.workspace import Workspace
 from mien.errors import CannotWriteError, UserError
+from mien.machine.progress import current_stage
 from mien.machine.stops import orderly_stops
 from mien.machine.system import end_this_process, peak_memory_mb
 from mien.machine.terminal import printable, tell
@@ -33,6 +39,10 @@ Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
 """Runs the steps of a row, and returns the figures of its runs and the seconds of its stages."""
 EXIT_BUSY = 75
 """Exit code of a row's process if another process holds the row."""
+Main = Callable[[list[str]], int]
+"""Runs a command of mien and returns its exit code."""
+_VIEWS, _SIDE = 12, 160
+"""Number of pictures in a thumbnail, and their sides in pixels."""
 _waited_for: dict[subprocess.Popen[bytes], bool] = {}
 """Processes of rows that `attempt` waits for, in any thread of this process, and whether each was told to stop."""
 
@@ -194,3 +204,72 @@ def repeat_command(batch: Batch, row: Row) -> str:
     workspace = str(batch.workspace(row.name))
     steps = [[word.replace(WORKSPACE, workspace) for word in step] for step in row.steps]
     return " && ".join(shlex.join(["mien", *step]) for step in steps)
+
+
+def do_steps(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
+    """Run the steps of a row with `main`, as `Do` does."""
+    workspace = batch.workspace(row.name)
+    stages: defaultdict[str, float] = defaultdict(float)
+    for step in row.steps:
+        words = [fetched(word.replace(WORKSPACE, str(workspace)), batch.place("inputs")) for word in step]
+        ended = threading.Event()
+        sampler = threading.Thread(target=_sample, args=(step[0], stages, ended), daemon=True)
+        sampler.start()
+        try:
+            code = main(words)
+        finally:
+            ended.set()
+            sampler.join()
+        if code >= 128:
+            raise SystemExit(code)  # it was told to stop
+        if code:
+            raise RowFailedError(last_error(batch.log_file(row.name)))
+    found = Workspace(workspace)
+    runs = tuple(figures_of(batch, row.name, found.run_dir(name)) for name in found.run_names())
+    return runs, {name: round(seconds, 1) for name, seconds in stages.items()}
+
+
+def _sample(step: str, stages: dict[str, float], ended: threading.Event) -> None:
+    """Add up the seconds of each stage of a step while it runs."""
+    before = time.monotonic()
+    while not ended.wait(0.5):
+        now = time.monotonic()
+        stages[current_stage() or step] += now - before
+        before = now
+    stages[current_stage() or step] += time.monotonic() - before
+
+
+def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
+    """The figures of a run as they come into the results: one value each. Writes the run's thumbnail as well."""
+    from mien.evaluation.metrics_file import figure, read_metrics
+    from mien.pages.pages import METRICS
+    from mien.training.run import read_run_config
+
+    found: dict[str, Any] = {"run": run_dir.name, "method": read_run_config(run_dir)["method"]["kind"]}
+    if (run_dir / "metrics.json").is_file():
+        content = read_metrics(run_dir)
+        scored = next((each for each in content["protocols"].values() if "psnr" in each), None)
+        for part, prefix in ((None, ""), ("head", "head_")):
+            for metric in METRICS:
+                found[prefix + metric] = None if scored is None else figure(scored, part, metric)
+        found |= {key: content["training"].get(key) for key in ("gaussians", "steps", "seconds")}
+        found["training_seconds"] = found.pop("seconds")
+    if (run_dir / "film.mp4").is_file():
+        thumbnail = batch.place("thumbs", f"{name}.{run_dir.name}.jpg")
+        write_atomically(thumbnail, partial(write_strip, run_dir / "film.mp4"))
+    return found
+
+
+def write_strip(film: Path, path: Path) -> None:
+    """Write pictures of a film side by side."""
+    from PIL import Image
+
+    from mien.media.video_file import open_video
+
+    with open_video(film) as (container, stream):
+        frames = [frame.to_image() for frame in container.decode(stream)]
+    chosen = [frames[index * len(frames) // _VIEWS] for index in range(_VIEWS)]
+    strip = Image.new("RGB", (_SIDE * _VIEWS, _SIDE))
+    for index, frame in enumerate(chosen):
+        strip.paste(frame.resize((_SIDE, _SIDE)), (index * _SIDE, 0))
+    strip.save(path, "JPEG", quality=80)

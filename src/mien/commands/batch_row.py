@@ -4,8 +4,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from mien.batch.row import row_process
-from mien.batch.steps import do_steps
+from mien.batch.row import do_steps, row_process
 from mien.cli import main
 
 if __name__ == "__main__":

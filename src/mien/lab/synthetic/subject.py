@@ -14,10 +14,10 @@ from mien.lab.synthetic.accessories import Glasses, RigidMesh, build_glasses, bu
 from mien.lab.synthetic.anatomy import CHIN, SIDES, Anatomy, measure_anatomy
 from mien.lab.synthetic.facial_hair import Lashes, RootedStrands, SkinStrands, grow_beard, grow_brows
 from mien.lab.synthetic.hair import DrapedStrands, HeadPose, Strands, grow_long_hair, grow_short_hair, ribbon_faces
-from mien.lab.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
 from mien.lab.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions
 from mien.lab.synthetic.recipe import PEOPLE, SyntheticRecipe
+from mien.lab.synthetic.shading import Lighting, Visibility, compute_visibility, studio_lighting
 from mien.lab.synthetic.skin import SkinTextures, paint_skin
 from mien.machine import exact
 
