@@ -22,7 +22,8 @@ from mien.plugins import named
 if TYPE_CHECKING:
     import torch
 
-    StepMethod = CaptureName = str
+    StepMethod = str
+    CaptureName = str
 else:
     StepMethod, CaptureName = Literal[tuple(STEP_BENCHMARKS)], Literal[tuple(PEOPLE["references"])]
 

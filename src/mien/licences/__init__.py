@@ -12,7 +12,7 @@ from importlib.metadata import Distribution, distributions
 from importlib.resources import files
 from typing import Any
 
-_FACTS: dict[str, Any] = tomllib.loads(files(__package__).joinpath("facts.toml").read_text(encoding="utf-8"))
+_FACTS: dict[str, Any] = tomllib.loads(files("mien.licences").joinpath("facts.toml").read_text(encoding="utf-8"))
 _KINDS = {licence: kind for kind, licences in _FACTS["kinds"].items() for licence in licences}
 PACKAGES: dict[str, tuple[str, str]] = _FACTS["packages"]
 """Name of a package -> its licence as an SPDX expression, and a note. They replace what its metadata says."""

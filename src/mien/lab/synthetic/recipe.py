@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any, Literal
 
-PEOPLE: dict[str, Any] = tomllib.loads(files(__package__).joinpath("people.toml").read_text(encoding="utf-8"))
+PEOPLE: dict[str, Any] = tomllib.loads(files("mien.lab.synthetic").joinpath("people.toml").read_text(encoding="utf-8"))
 """The tables of the drawn people: expressions, colours, shared recipes and reference captures."""
 SIDES: dict[str, tuple[float, float]] = {
     **{f"{side}-{angle}": (sign * angle, 0.0) for angle in (15, 30, 45, 60, 90)

@@ -86,7 +86,7 @@ def _reference(
 ) -> ReferenceCapture:
     """A reference capture from its entry in people.toml."""
     recipes = tuple(_recipe({"name": name, **one}) for one in sequences)
-    named = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
+    named: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return ReferenceCapture(name, sequences=recipes, views=SideViews(**views) if views else None, **named)
 
 
