@@ -21,8 +21,7 @@ from typing import Any
 from batch_stub import note, watched
 from mien.batch.plan import Batch, Row
 from mien.batch.progress import batch_progress, progress_text
-from mien.batch.row import row_process
-from mien.batch.steps import do_with
+from mien.batch.row import do_steps, row_process
 from mien.cli import main as mien
 from mien.disk.files import read_json
 
@@ -37,7 +36,7 @@ def real_row(root: Path) -> int:
         with watched(root / "begins.txt", row.name):
             start = batch.log_file(row.name).stat().st_size
             note(root / "begins.txt", f"begin {row.name} {os.getpid()} {start}\n")
-            return do_with(mien)(batch, row)
+            return do_steps(mien, batch, row)
 
     return row_process(root, sys.stdin, do)
 

@@ -10,8 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from mien.licences.facts import PACKAGES, PARTS
-from mien.licences.installed import canonical
+from mien.licences import PACKAGES, PARTS, canonical
 
 _CREATED = "2026-11-26T00:00:00Z"
 """The format asks for a date. It is fixed, so that two builds give the same bytes."""

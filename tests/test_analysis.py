@@ -18,6 +18,7 @@ import toy_scene
 import train_toy
 from capture_helpers import tree_bytes
 from damage import edit_json
+from mien.avatar import load_avatar
 from mien.cli import main
 from mien.disk.files import write_tensors
 from mien.face import FaceModel
@@ -96,6 +97,11 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
     assert all(row["fps"] > 0 and row["peak_mb"] >= row["before_mb"] > 0 for row in rows)
     trained = parts["scale"]["values"]["rows"]
     assert [row["gaussians"] > 0 and row["head_psnr"] > 0 for row in trained] == [True, True]
+    runs = [next((folder / "runs").glob(f"{name}-2-*")) for name in ("scale-threshold", "scale-no-threshold")]
+    for row, avatar in zip(trained, map(load_avatar, runs), strict=True):
+        assert avatar.config.scale_threshold == (0.6 if row == trained[0] else 0)  # type: ignore[attr-defined]
+        largest = avatar.gaussian_store()["log_scales"].detach().exp().amax(-1)
+        assert row["median_scale"] == pytest.approx(float(largest.median()), abs=6e-4)
     teeth = parts["teeth"]["values"]
     assert 0 < teeth["teeth_gaussians"] < teeth["gaussians"]
     after = tree_bytes(workspace)
@@ -247,8 +253,11 @@ def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.Monk
 def test_a_damaged_record_is_told_and_links_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     analyze(workspace, "--parts", "growth")
     capsys.readouterr()
-    edit_json(workspace / "analysis/toy/analysis.json", lambda content: content.update(parts=3))
-    assert "analysis.json: incomplete or damaged" in complaint(capsys, "analyze", str(workspace), "--parts", "growth")
+    record = workspace / "analysis/toy/analysis.json"
+    for damage in (lambda content: content["parts"]["growth"].pop("findings"), lambda content: content.update(parts=3)):
+        edit_json(record, damage)
+        told = complaint(capsys, "analyze", str(workspace), "--parts", "growth")
+        assert "analysis.json: incomplete or damaged" in told
     shutil.rmtree(workspace / "analysis")
     (workspace / "analysis").symlink_to(workspace.parent)
     assert "analysis" in complaint(capsys, "analyze", "gaussian-avatars", str(workspace))

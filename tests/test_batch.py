@@ -20,14 +20,13 @@ from mien.batch.drive import shard_of
 from mien.batch.plan import Batch, Row, State
 from mien.batch.progress import batch_progress, progress_text
 from mien.batch.results import write_results
-from mien.batch.row import attempt, run_row
-from mien.batch.steps import write_strip
+from mien.batch.row import attempt, run_row, write_strip
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.disk.files import write_atomically
 from mien.disk.locks import hold
 from other_process import Holder
-from refusals import complaint, refuses
+from refusals import refuses
 
 
 def run_stubs(batch: Batch, rows: list[Row], **options: object) -> dict[str, str]:
@@ -56,7 +55,7 @@ def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(tmp_path: Path, mo
     (tmp_path / "squeue").chmod(0o755)
     queued.write_text("77_0 RUNNING\n")
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr("mien.batch.slurm.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("mien.batch.engines.POLL_SECONDS", 0.05)
     (batch.root / "slurm").mkdir()
     (batch.root / "slurm" / "jobs.txt").write_text("77")
 
@@ -193,7 +192,7 @@ def test_a_row_that_another_command_holds_is_left_to_it(tmp_path: Path, monkeypa
 
 
 def test_memory_is_counted_before_rows_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("mien.batch.local.free_memory_mb", lambda: 1000.0)
+    monkeypatch.setattr("mien.batch.engines.free_memory_mb", lambda: 1000.0)
     rows = [stub_row(f"big{index}", ("sleep", "0.3"), memory_mb=700.0) for index in range(2)]
     rows.append(stub_row("huge", ("sleep", "0.1"), memory_mb=5000.0))
     assert set(run_stubs(Batch(tmp_path), rows, jobs=4).values()) == {"done"}
@@ -258,7 +257,7 @@ def test_no_link_in_a_batch_is_followed(tmp_path: Path, place: str) -> None:
     way = ways.get(place.split("/")[0], lambda name: batch.place("thumbs", f"{name}.jpg"))
     refuses("is a link, and links", way, "ann")
     if place.startswith("logs"):
-        refuses("is a link, and links", attempt, batch.root, stub_row("ann"), PROGRAM)
+        refuses("is a link, and links", attempt, batch.root, PROGRAM, None, stub_row("ann"))
     assert outside.read_text() == "mine" if "." in place else not any(outside.iterdir())
 
 
@@ -277,15 +276,20 @@ def hostile(**given: object) -> str:
     hostile(began=1e308, seconds=1e308, status="running"),
     hostile(seconds=float("nan")),
     hostile(mien=["0"]),
+    hostile(version=99),
+    hostile(stages={"a": "x"}),
+    hostile(status="bogus"),
+    "{",
 ])  # fmt: skip
 def test_hostile_states_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str) -> None:
     batch = Batch(tmp_path)
-    batch.write_plan([Row("ann", ())])
-    batch.state_file("ann").parent.mkdir()
+    batch.write_plan([Row("ann", ()), Row("bob", ())])
+    batch.write_state(State("bob", "done", "", runs=({"run": "a", "method": "a", "psnr": 31.0},)))
     batch.state_file("ann").write_text(content)
     assert main(["batch", "status", str(tmp_path)]) == 0
     assert f"ann: failed, try 1: {batch.state_file('ann')}: " in capsys.readouterr().out
-    assert "no row is done yet" in complaint(capsys, "batch", "table", str(tmp_path))
+    assert main(["batch", "table", str(tmp_path), "--columns", "psnr"]) == 0
+    assert "| a | 1 | 31.00 |" in capsys.readouterr().out
 
 
 def test_formulas_in_headings_are_defused(tmp_path: Path) -> None:

@@ -119,8 +119,8 @@ def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: An
 
 
 def test_a_row_that_no_node_of_ray_can_hold_fails_alone(tmp_path: Path, ray_cluster: Any, monkeypatch: Any):
-    monkeypatch.setattr("mien.batch.on_ray.LOOK_SECONDS", 0.5)
-    monkeypatch.setattr("mien.batch.on_ray.PATIENCE_SECONDS", 1.0)
+    monkeypatch.setattr("mien.batch.engines.LOOK_SECONDS", 0.5)
+    monkeypatch.setattr("mien.batch.engines.PATIENCE_SECONDS", 1.0)
     check_too_large("ray", tmp_path, "enough memory", address=ray_cluster.address)
 
 

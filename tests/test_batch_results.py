@@ -12,9 +12,8 @@ from PIL import Image
 
 from batch_stub import PROGRAM
 from mien.batch.plan import Batch, Row, State
-from mien.batch.results import latex_table, markdown_table, means_by, write_results
-from mien.batch.steps import write_strip
-from mien.batch.wall import write_wall
+from mien.batch.results import latex_table, markdown_table, means_by, write_results, write_wall
+from mien.batch.row import write_strip
 from mien.cli import main
 from mien.commands import batch as batch_command
 from mien.commands.batch_table import read_table
@@ -121,21 +120,7 @@ def test_what_makes_no_sense_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert told in complaint(capsys, "batch", *shlex.split(line))
 
 
-def test_any_damage_of_a_state_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    batch = Batch(tmp_path)
-    scored(batch)
-    file = batch.state_file("ann")
-    whole = json.loads(file.read_text())
-    for changed in (
-        {"version": 99}, {"status": []}, {"status": "bogus"}, {"runs": [1]}, {"stages": "x"}, {"stages": {"a": "x"}},
-        {"began": float("nan")}, {"tries": None}, None,
-    ):  # fmt: skip
-        file.write_text("{" if changed is None else json.dumps(whole | changed))
-        assert main(["batch", "status", str(tmp_path)]) == 0
-        assert "ann: failed, try 1: " in capsys.readouterr().out, changed
-    assert main(["batch", "table", str(tmp_path), "--columns", "psnr"]) == 0
-    assert "| a | 1 | 31.00 |" in capsys.readouterr().out
-    # Rows of an earlier table are told.
+def test_rows_of_an_earlier_table_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     scored(Batch(tmp_path / "out"))
     (tmp_path / "d.mp4").write_bytes(b"a video")
     (tmp_path / "table.csv").write_text("name,video\nann,d.mp4\n")

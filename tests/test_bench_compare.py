@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +15,13 @@ import torch
 from capture_helpers import random_capture
 from mien.avatar.methods import METHODS
 from mien.cli import main
-from mien.commands.bench import CaptureName, Compare
+from mien.commands.bench import Compare
 from mien.disk.workspace import Workspace
 from mien.face.loading import add_face_model
-from mien.lab.benchmarking import following, quality
+from mien.lab.benchmarking import quality
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table, unseen_mean
 from mien.lab.synthetic import RECIPES
 from mien.lab.synthetic.recipe import Segment
-from mien.lab.synthetic.references import REFERENCES
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.lab.synthetic.truth import Truth, truth_of
 from mien.pipeline import comparing
@@ -270,11 +269,10 @@ def test_the_table_names_key_and_baselines(tmp_path, capsys):
     assert "mean frame" in table
     assert "| mesh |" in table
     assert "1.00 mm | 2.00 px | 3.00 (0.50) deg | - | - | - | - |" in table
-    known = quality.TrackingErrors(1.0, 2.0, 3.0, 0.5, 0.02, 0.04, following.Following(0.3, 7.0, 5), None, 0.61)
+    known = quality.TrackingErrors(1.0, 2.0, 3.0, 0.5, 0.02, 0.04, quality.Following(0.3, 7.0, 5), None, 0.61)
     assert quality.tracking_cells(known)[-4:] == ["0.020 px, 0.040 mm", "0.30 frames, 7 % (5)", "-", "0.61 %"]
     # An unknown capture is told.
     assert "mono-short" in complaint(capsys, "bench", "quality", "--captures", "mono", "--out", str(tmp_path))
-    assert set(get_args(CaptureName)) == set(REFERENCES), "the command line knows their names without importing them"
 
 
 FPS = 25.0
@@ -286,8 +284,8 @@ def bumps(delay: float = 0.0, height: float = 1.0, width: float = 2.0) -> np.nda
     return height * np.stack([np.exp(-(((TIME - at - delay) / width) ** 2)) for at in (30.0, 62.0)]).sum(0)
 
 
-def found_in(values: np.ndarray) -> following.Following:
-    found = following.following(values[:, None], bumps()[:, None], bumps() > 0.3, 6)
+def found_in(values: np.ndarray) -> quality.Following:
+    found = quality.following(values[:, None], bumps()[:, None], bumps() > 0.3, 6)
     assert found is not None
     return found
 
@@ -298,18 +296,18 @@ def test_delay_and_height_are_found_in_coefficients_and_in_turns():
         assert found.lag_frames == pytest.approx(delay, abs=0.1)
         assert (found.loss_percent, found.events) == (pytest.approx(100 * (1 - height), abs=2), 2)
     # Where nothing happens there is nothing to measure, and an event that was not tracked is left out.
-    assert following.following(bumps()[:, None], bumps()[:, None], np.zeros(len(TIME), bool), 6) is None
+    assert quality.following(bumps()[:, None], bumps()[:, None], np.zeros(len(TIME), bool), 6) is None
     gap = bumps()
     gap[28:33] = np.nan
     assert found_in(gap).events == 1
     _, truth = exact_of(turns())
     off = matrix_from_axis_angle(torch.tensor([0.05, 0.1, -0.08]))
     late = axis_angle_from_matrix(matrix_from_axis_angle(turns(1.5, 0.9)) @ off.T)
-    found = following.turn_following(exact_of(late)[0], truth, FPS)
+    found = quality.turn_following(exact_of(late)[0], truth, FPS)
     assert found is not None
     assert found.lag_frames == pytest.approx(1.5, abs=0.1)
     assert found.loss_percent == pytest.approx(10, abs=2)
-    assert following.turn_following(exact_of(turns())[0], exact_of(0 * turns())[1], FPS) is None
+    assert quality.turn_following(exact_of(turns())[0], exact_of(0 * turns())[1], FPS) is None
 
 
 def exact_of(rotations: torch.Tensor) -> tuple[Tracking, Truth]:
@@ -335,25 +333,25 @@ def test_blinks_are_seen_in_the_lids():
 
     def blinking(delay: float, depth: float) -> np.ndarray:
         points = open_eyes.copy()
-        for upper, lower in following.LIDS:
+        for upper, lower in quality.LIDS:
             share = depth * bumps(delay)[:, None, None]
             points[:, :, upper] += share * (points[:, :, lower] - points[:, :, upper])
         return points
 
     true, tracked = blinking(0.0, 0.9), blinking(1.0, 0.6)
-    assert following.eye_opening(true[:, 0]).min() < 0.2 * following.eye_opening(true[:, 0]).max()
-    found = following.blink_following(tracked, true, truth, FPS)
+    assert quality.eye_opening(true[:, 0]).min() < 0.2 * quality.eye_opening(true[:, 0]).max()
+    found = quality.blink_following(tracked, true, truth, FPS)
     assert found is not None
     assert (found.events, found.lag_frames) == (2, pytest.approx(1.0, abs=0.1))
     assert found.loss_percent == pytest.approx(100 * (1 - 0.6 / 0.9), abs=3)
-    assert following.blink_following(tracked, open_eyes, truth, FPS) is None
+    assert quality.blink_following(tracked, open_eyes, truth, FPS) is None
     # Jitter counts where the truth stands still.
     true = np.zeros((20, 1, 478, 2), np.float32)
     true[10:] += np.arange(10)[:, None, None, None]
-    still = following.still_timesteps(true)
+    still = quality.still_timesteps(true)
     assert (still[:8].all(), still[9:].any()) == (True, False)
     points = np.zeros((20, 478, 3))
     points[1::2, :, 0] = 0.001
     points[12:] = 50 * np.random.default_rng(0).standard_normal((8, 478, 3))
-    assert following.jitter(points, still) == pytest.approx(0.002)
-    assert following.jitter(points, np.zeros(18, bool)) is None
+    assert quality.jitter(points, still) == pytest.approx(0.002)
+    assert quality.jitter(points, np.zeros(18, bool)) is None

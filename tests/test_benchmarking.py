@@ -15,7 +15,7 @@ from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
-from mien.lab.benchmarking import headgas_step, mono_step, step_parts, train_step
+from mien.lab.benchmarking import method_steps, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, thread_counts, time_function
 from mien.training.trainer import step
@@ -39,9 +39,9 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
     assert 0 < timing.min_ms <= timing.median_ms
     assert timing.cpu_ms > 0
     # Times of a step are those of one frame.
-    state, _ = mono_step.mono_case(load_face_model(), 3000, (64, 48), frames=4)
+    state, _ = method_steps.mono_case(load_face_model(), 3000, (64, 48), frames=4)
     assert state.avatar.extras.frames_per_step() == 4
-    row = mono_step.per_frame(benchmark_row("a step", 3000, (64, 48), Timing(8.0, 12.0, 16.0)), 4)
+    row = method_steps.per_frame(benchmark_row("a step", 3000, (64, 48), Timing(8.0, 12.0, 16.0)), 4)
     assert (row.min_ms, row.median_ms, row.cpu_ms) == (2.0, 3.0, 4.0)
     # Waiting for a picture is measured with the worker and without.
     rows = list(train_step.waiting_rows(load_face_model(), 500, (64, 48), 0.01))
@@ -111,9 +111,9 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("made", "count", "name", "shape"),
     [
-        (lambda: headgas_step.headgas_case(load_face_model(), HeadGasConfig(features=4), 500, (96, 80)), 3, "bases",
+        (lambda: method_steps.headgas_case(load_face_model(), HeadGasConfig(features=4), 500, (96, 80)), 3, "bases",
          (500, 20, 4)),
-        (lambda: mono_step.mono_case(load_face_model(), 4000, (96, 80)), 3, "means", (4000, 3)),
+        (lambda: method_steps.mono_case(load_face_model(), 4000, (96, 80)), 3, "means", (4000, 3)),
         (lambda: train_step.training_case(load_face_model(), 2000, 96, 80), 10, "sh_constant", (2000, 1, 3)),
     ],
 )  # fmt: skip

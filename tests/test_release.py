@@ -14,8 +14,7 @@ import pytest
 from scikit_build_core.build import build_sdist
 
 from mien.cli import main
-from mien.licences.facts import PACKAGES, PARTS
-from mien.licences.installed import canonical, installed_licences, kind_of
+from mien.licences import PACKAGES, PARTS, canonical, installed_licences, kind_of
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "release"))

@@ -3,8 +3,18 @@
 import numpy as np
 import pytest
 
-from mien.lab.analysis.study.files import QUESTIONS, Answer, Answers, KeyClip, StudyKey
-from mien.lab.analysis.study.tally import interval, student_quantile, tally_content, tally_text, wilson
+from mien.lab.analysis.study.files import (
+    QUESTIONS,
+    Answer,
+    Answers,
+    KeyClip,
+    StudyKey,
+    interval,
+    student_quantile,
+    tally_content,
+    tally_text,
+    wilson,
+)
 
 
 def test_few_participants_have_wider_intervals_by_student_s_factor() -> None:

@@ -19,8 +19,7 @@ from dataset_writers import BENCHMARK_SCALE, write_benchmark
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.avatar.settings import FaceTuning
 from mien.batch.plan import Batch
-from mien.batch.row import run_row
-from mien.batch.steps import do_with
+from mien.batch.row import do_steps, run_row
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.datasets import overlay, pictures, sequences
@@ -212,11 +211,11 @@ def test_people_are_imported_trained_and_scored_by_one_table(tmp_path, monkeypat
     damaged.write_text(whole.replace("world_mat", "world_mad", 1))
     batch, rows = Batch(tmp_path / "out"), read_table(table)
     batch.write_plan(rows)
-    states = [run_row(batch, row, do_with(_quietly)) for row in rows]
+    states = [run_row(batch, row, partial(do_steps, _quietly)) for row in rows]
     assert [state.status for state in states if state is not None] == ["done", "failed"]
     assert (batch.workspace("subject1") / "sequences/MVI_1810").is_dir(), "what was read stays"
     damaged.write_text(whole)
-    mended = run_row(batch, rows[1], do_with(_quietly))
+    mended = run_row(batch, rows[1], partial(do_steps, _quietly))
     assert mended is not None
     assert mended.status == "done"
     capsys.readouterr()

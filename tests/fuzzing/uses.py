@@ -48,8 +48,7 @@ from mien.formats import in_world, read_ply, write_ply
 from mien.formats.gaussian_avatars import write_gaussian_avatars_folder
 from mien.lab.analysis.registry import AnalysisOptions
 from mien.lab.analysis.running import run_analysis
-from mien.lab.analysis.study.files import read_all_answers, read_key
-from mien.lab.analysis.study.tally import tally_content, tally_text
+from mien.lab.analysis.study.files import read_all_answers, read_key, tally_content, tally_text
 from mien.media.source import FrameSelection, open_source, read_image
 from mien.media.video import count_frames, probe_video, read_video_frames
 from mien.pipeline.import_dataset import front_camera

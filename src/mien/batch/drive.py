@@ -1,10 +1,6 @@
-"""Drives a batch: hands its rows to an engine, tries failed ones again, and keeps what comes back.
+"""Drives a batch: hands its rows to an engine, tries failed ones again, and keeps what comes back."""
 
-An engine (`local.run`, `slurm.run`, `on_ray.run`) takes the work, the rows, the batch and the options. It tries every
-row once and yields each with what the work returned, or with an exception, in the order in which they end.
-"""
-
-import importlib
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
@@ -12,10 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mien.batch.engines import ENGINES, jobs_here, wait_for_earlier
 from mien.batch.plan import Batch, Options, Row, State, Work
 from mien.batch.progress import running_words
-from mien.batch.row import PROGRAM, attempt
-from mien.batch.store import attempt_in_store
+from mien.batch.row import attempt
+from mien.batch.store import store_of
 from mien.disk.files import write_atomically
 from mien.disk.locks import BeingWrittenError, hold, holder_of
 from mien.errors import UserError
@@ -47,10 +44,8 @@ def drive(batch: Batch, rows: Sequence[Row], options: Options, work: Work | None
 
     `work` replaces the process of a row, for trials of the engines.
     """
-    name = "on_ray" if options.engine == "ray" else options.engine
-    engine = importlib.import_module(f"mien.batch.{name}")  # needs packages of its own
     if options.engine == "slurm":
-        engine.wait_for_earlier(batch)
+        wait_for_earlier(batch)
     left = [row for row in rows if not batch.is_done(row)]
     say(f"{counted(len(rows), 'row')}: {len(rows) - len(left)} done before, {len(left)} to do on {options.engine}")
     with (
@@ -61,7 +56,7 @@ def drive(batch: Batch, rows: Sequence[Row], options: Options, work: Work | None
             with ExitStack() as claims:
                 taken = _taken(batch, left, options, claims)
                 todo = work or _work(batch, taken, options)
-                for row, outcome in engine.run(todo, taken, batch, options) if taken else ():
+                for row, outcome in ENGINES[options.engine](todo, taken, batch, options) if taken else ():
                     if _keep(batch, row, outcome, bool(options.store)):
                         advance(1, row.name)
                     elif turn == options.retry:
@@ -114,25 +109,47 @@ def _taken(batch: Batch, rows: Sequence[Row], options: Options, claims: ExitStac
 def _work(batch: Batch, rows: Sequence[Row], options: Options) -> Work:
     threads = options.threads or None
     if options.engine == "local" and threads is None:
-        from mien.batch.local import jobs_here
         from mien.machine.threads import thread_count
 
         threads = max(1, thread_count() // jobs_here(rows, options))
-    if options.store:
-        return partial(attempt_in_store, options.store, options.program, threads)
-    return partial(_attempt, batch.root.resolve(), options.program, threads)
+    place = (attempt_in_store, options.store) if options.store else (attempt, batch.root.resolve())
+    return partial(*place, options.program, threads)
 
 
-def _attempt(root: Path, program: tuple[str, ...], threads: int | None, row: Row) -> State | None:
-    return attempt(root, row, program or PROGRAM, threads)
+def attempt_in_store(
+    store: str, program: Sequence[str], threads: int | None, row: Row
+) -> tuple[State | None, dict[str, bytes]]:
+    """Run a row in a temporary folder of this machine, with its workspace copied in from a store and out to it.
+
+    The store is the URL of the folder of all workspaces, such as s3://bucket/people. Returns the row's state, and its
+    thumbnails and log: path in the batch's folder -> content.
+    """
+    fs, base = store_of(store)
+    place = f"{base.rstrip('/')}/{row.name}"
+    with tempfile.TemporaryDirectory(prefix="mien-batch-") as scratch:
+        batch = Batch(Path(scratch))
+        workspace = batch.workspace(row.name)
+        if fs.exists(place):
+            workspace.parent.mkdir(parents=True)
+            fs.get(place, str(workspace), recursive=True)
+        state = attempt(batch.root, program, threads, row)
+        if workspace.is_dir():
+            fs.makedirs(place, exist_ok=True)
+            fs.put(f"{workspace}/", f"{place}/", recursive=True)
+            ours = {path.relative_to(workspace).as_posix() for path in workspace.rglob("*")}
+            for gone in fs.find(place):
+                if gone.removeprefix(f"{place}/") not in ours:
+                    fs.rm_file(gone)
+        kept = [*batch.root.glob("thumbs/*"), *batch.root.glob("logs/*")]
+        return state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept}
 
 
 def _keep(batch: Batch, row: Row, outcome: Any, in_store: bool) -> bool:
     """Keep what a row sent back, and return whether the row is done."""
     failed = isinstance(outcome, Exception)
     if failed:
-        before, error = batch.read_state(row.name), " ".join(str(outcome).split())[:500]
-        state = State(row.name, "failed", row.fingerprint, before.tries + 1 if before is not None else 1, error=error)
+        error = " ".join(str(outcome).split())[:500]
+        state = State(row.name, "failed", row.fingerprint, batch.tries(row) + 1, error=error)
     else:
         state, files = outcome if in_store else (outcome, {})
         for name, content in files.items():

@@ -6,6 +6,7 @@ file writes it. DIR/logs/NAME.log has what the row's commands printed, and DIR/r
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -89,8 +90,8 @@ class Options:
     """How often a failed row is tried again."""
     store: str = ""
     """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
-    program: tuple[str, ...] = ()
-    """The command of a row's process. Empty means this Python with `-m mien.commands.batch_row`."""
+    program: tuple[str, ...] = (sys.executable, "-m", "mien.commands.batch_row")
+    """The command of a row's process."""
 
 
 Work = Callable[[Row], Any]
@@ -172,6 +173,11 @@ class Batch:
         """Whether the row is done with its present inputs."""
         state = self.read_state(row.name)
         return state is not None and state.status == "done" and state.fingerprint == row.fingerprint
+
+    def tries(self, row: Row) -> int:
+        """How often the row was tried with its present inputs."""
+        state = self.read_state(row.name)
+        return state.tries if state is not None and state.fingerprint == row.fingerprint else 0
 
 
 def with_fingerprint(row: Row, inputs: Sequence[Path]) -> Row:

@@ -1,4 +1,4 @@
-"""The results of a batch: one line for each run, comparisons of methods, and tables for papers."""
+"""The results of a batch: one line for each run, comparisons of methods, tables for papers, and the wall."""
 
 import csv
 import io
@@ -12,7 +12,8 @@ from typing import Any
 from mien.batch.plan import Batch
 from mien.disk.files import write_atomically
 from mien.errors import UserError
-from mien.pages.pages import COLUMNS
+from mien.machine.terminal import counted
+from mien.pages.pages import COLUMNS, LIVING_PAGE, render
 
 HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
 HIGHER = {name: higher for name, _, _, higher in COLUMNS}
@@ -145,3 +146,57 @@ def _latex(cell: str) -> str:
     special = {"\\": r"\textbackslash{}", "±": r"$\pm$", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     special |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
     return "".join(special.get(letter, letter) for letter in cell)
+
+
+def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
+    """Write index.html: thumbnails that turn, worst first, with a link to each report, and methods compared."""
+    shown = [_card(batch, row) for row in rows if row.get("run")]
+    shown.sort(key=lambda card: card["figures"].get("psnr", float("-inf")))
+    failed = [row for row in rows if not row.get("run") and row["status"] == "failed"]
+    compared = paired(rows)
+    text = render(
+        "batch/templates/wall.html",
+        heading=batch.root.resolve().name,
+        summary=f"{counted(len(shown), 'avatar')}; {counted(len(failed), 'row')} failed",
+        cards=shown,
+        failed=failed[:200],
+        orders=[
+            (name, HEADINGS[name], HIGHER[name]) for name in HIGHER if any(name in card["figures"] for card in shown)
+        ],
+        comparison=[_compared(entry) for entry in compared],
+        several=any("minus" in entry for entry in compared),
+    )
+    write_atomically(batch.root / "index.html", lambda aside: aside.write_text(text, encoding="utf-8"))
+
+
+def _card(batch: Batch, row: dict[str, Any]) -> dict[str, Any]:
+    thumbnail = f"thumbs/{row['name']}.{row['run']}.jpg"
+    page = f"rows/{row['name']}/{LIVING_PAGE}"
+    report = f"rows/{row['name']}/runs/{row['run']}/report.html"
+    figures = {name: row[name] for name in HIGHER if isinstance(row.get(name), int | float)}
+    return {
+        "name": row["name"],
+        "run": row["run"],
+        "thumbnail": thumbnail if (batch.root / thumbnail).is_file() else None,
+        "page": page if (batch.root / page).is_file() else None,
+        "report": report if (batch.root / report).is_file() else None,
+        "figures": figures,
+        "words": [_figure(name, value) for name, value in figures.items()],
+    }
+
+
+def _figure(name: str, value: float) -> str:
+    """A figure with its name before it and its unit behind it, such as PSNR 25.31 dB."""
+    heading, _, unit = HEADINGS[name].partition(", ")
+    return f"{heading} {value:.{DIGITS[name]}f} {unit}".rstrip()
+
+
+def _compared(entry: dict[str, Any]) -> list[str]:
+    digits = DIGITS[entry["metric"].removeprefix("head_")] + 1
+    head = "head " if entry["metric"].startswith("head_") else ""
+    what = entry["method"] + (f" - {entry['minus']}" if "minus" in entry else "")
+    middle = f"{entry['median']:.{digits}f}" if "median" in entry else ""
+    ends = entry.get("interval")
+    between = f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}" if ends else ""
+    figure = head + HEADINGS[entry["metric"].removeprefix("head_")]
+    return [figure, what, str(entry["rows"]), f"{entry['mean']:.{digits}f}", middle, between]

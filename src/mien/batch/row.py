@@ -1,4 +1,4 @@
-"""One row: the claim on it, its steps, its state; and the process in which it runs.
+"""One row: the claim on it, its steps, its state, its figures; and the process in which it runs.
 
 `run_row` runs in a process of its own, so that a row that needs too much memory fails alone. That process holds the
 row's lock and runs the steps itself: whatever kills it frees the lock and leaves nothing behind. `attempt` starts it
@@ -11,31 +11,38 @@ import shlex
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import mien
 from mien.batch.plan import WORKSPACE, Batch, Row, State
+from mien.batch.store import fetched
 from mien.disk.config import decode
+from mien.disk.files import write_atomically
 from mien.disk.inside import open_to_append, open_to_read
 from mien.disk.locks import BeingWrittenError, hold
+from mien.disk.workspace import Workspace
 from mien.errors import CannotWriteError, UserError
+from mien.machine.progress import current_stage
 from mien.machine.stops import orderly_stops
 from mien.machine.system import end_this_process, peak_memory_mb
 from mien.machine.terminal import printable, tell
 
 Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
 """Runs the steps of a row, and returns the figures of its runs and the seconds of its stages."""
-PROGRAM = (sys.executable, "-m", "mien.commands.batch_row")
-"""The command of a row's process."""
 EXIT_BUSY = 75
 """Exit code of a row's process if another process holds the row."""
+Main = Callable[[list[str]], int]
+"""Runs a command of mien and returns its exit code."""
+_VIEWS, _SIDE = 12, 160
+"""Number of pictures in a thumbnail, and their sides in pixels."""
 _waited_for: dict[subprocess.Popen[bytes], bool] = {}
 """Processes of rows that `attempt` waits for, in any thread of this process, and whether each was told to stop."""
 
@@ -60,14 +67,11 @@ def run_row(batch: Batch, row: Row, do: Do, patience: float = 0.0) -> State | No
             time.sleep(0.5)
 
 
-def _claimed(batch: Batch, row: Row, do: Do) -> State:
-    before = batch.read_state(row.name)
-    if before is not None and before.status == "done" and before.fingerprint == row.fingerprint:
-        return before
-    same = before is not None and before.fingerprint == row.fingerprint
-    tries = before.tries + 1 if before is not None and same else 1
+def _claimed(batch: Batch, row: Row, do: Do) -> State | None:
+    if batch.is_done(row):
+        return batch.read_state(row.name)
     here = f"{socket.gethostname()}, process {os.getpid()}"
-    state = State(row.name, "running", row.fingerprint, tries, here, time.time(), mien=mien.__version__)
+    state = State(row.name, "running", row.fingerprint, batch.tries(row) + 1, here, time.time(), mien=mien.__version__)
     batch.write_state(state)
     try:
         runs, stages = do(batch, row)
@@ -79,7 +83,7 @@ def _claimed(batch: Batch, row: Row, do: Do) -> State:
     return state
 
 
-def attempt(root: Path, row: Row, program: Sequence[str] = PROGRAM, threads: int | None = None) -> State | None:
+def attempt(root: Path, program: Sequence[str], threads: int | None, row: Row) -> State | None:
     """Run a row in a process of its own and wait for it. Return its state.
 
     None if another process holds the row, or if `stop_attempts` stopped it, which then counts as interrupted.
@@ -138,11 +142,10 @@ def _concluded(batch: Batch, row: Row, code: int, started: float, printed: int) 
         state = batch.read_state(row.name)
         if told(state):
             return state
-        before = state if state is not None and state.fingerprint == row.fingerprint else None
-        if before is None or before.began < started:  # the process had not even claimed the row
-            before = State(row.name, "failed", row.fingerprint, before.tries + 1 if before else 1, began=started)
-        seconds = round(time.time() - before.began, 2)
-        failed = replace(before, status="failed", seconds=seconds, error=_why(batch, row, code, printed))
+        if state is None or state.fingerprint != row.fingerprint or state.began < started:  # it had not even claimed it
+            state = State(row.name, "failed", row.fingerprint, batch.tries(row) + 1, began=started)
+        seconds = round(time.time() - state.began, 2)
+        failed = replace(state, status="failed", seconds=seconds, error=_why(batch, row, code, printed))
         with suppress(CannotWriteError):  # the disk is full; the engine tells of the state all the same
             batch.write_state(failed)
         return failed
@@ -201,3 +204,72 @@ def repeat_command(batch: Batch, row: Row) -> str:
     workspace = str(batch.workspace(row.name))
     steps = [[word.replace(WORKSPACE, workspace) for word in step] for step in row.steps]
     return " && ".join(shlex.join(["mien", *step]) for step in steps)
+
+
+def do_steps(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
+    """Run the steps of a row with `main`, as `Do` does."""
+    workspace = batch.workspace(row.name)
+    stages: defaultdict[str, float] = defaultdict(float)
+    for step in row.steps:
+        words = [fetched(word.replace(WORKSPACE, str(workspace)), batch.place("inputs")) for word in step]
+        ended = threading.Event()
+        sampler = threading.Thread(target=_sample, args=(step[0], stages, ended), daemon=True)
+        sampler.start()
+        try:
+            code = main(words)
+        finally:
+            ended.set()
+            sampler.join()
+        if code >= 128:
+            raise SystemExit(code)  # it was told to stop
+        if code:
+            raise RowFailedError(last_error(batch.log_file(row.name)))
+    found = Workspace(workspace)
+    runs = tuple(figures_of(batch, row.name, found.run_dir(name)) for name in found.run_names())
+    return runs, {name: round(seconds, 1) for name, seconds in stages.items()}
+
+
+def _sample(step: str, stages: dict[str, float], ended: threading.Event) -> None:
+    """Add up the seconds of each stage of a step while it runs."""
+    before = time.monotonic()
+    while not ended.wait(0.5):
+        now = time.monotonic()
+        stages[current_stage() or step] += now - before
+        before = now
+    stages[current_stage() or step] += time.monotonic() - before
+
+
+def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
+    """The figures of a run as they come into the results: one value each. Writes the run's thumbnail as well."""
+    from mien.evaluation.metrics_file import figure, read_metrics
+    from mien.pages.pages import METRICS
+    from mien.training.run import read_run_config
+
+    found: dict[str, Any] = {"run": run_dir.name, "method": read_run_config(run_dir)["method"]["kind"]}
+    if (run_dir / "metrics.json").is_file():
+        content = read_metrics(run_dir)
+        scored = next((each for each in content["protocols"].values() if "psnr" in each), None)
+        for part, prefix in ((None, ""), ("head", "head_")):
+            for metric in METRICS:
+                found[prefix + metric] = None if scored is None else figure(scored, part, metric)
+        found |= {key: content["training"].get(key) for key in ("gaussians", "steps", "seconds")}
+        found["training_seconds"] = found.pop("seconds")
+    if (run_dir / "film.mp4").is_file():
+        thumbnail = batch.place("thumbs", f"{name}.{run_dir.name}.jpg")
+        write_atomically(thumbnail, partial(write_strip, run_dir / "film.mp4"))
+    return found
+
+
+def write_strip(film: Path, path: Path) -> None:
+    """Write pictures of a film side by side."""
+    from PIL import Image
+
+    from mien.media.video_file import open_video
+
+    with open_video(film) as (container, stream):
+        frames = [frame.to_image() for frame in container.decode(stream)]
+    chosen = [frames[index * len(frames) // _VIEWS] for index in range(_VIEWS)]
+    strip = Image.new("RGB", (_SIDE * _VIEWS, _SIDE))
+    for index, frame in enumerate(chosen):
+        strip.paste(frame.resize((_SIDE, _SIDE)), (index * _SIDE, 0))
+    strip.save(path, "JPEG", quality=80)

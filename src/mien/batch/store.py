@@ -1,13 +1,9 @@
-"""Files on other machines by fsspec: inputs by their URLs, and workspaces that are copied in and out of a store."""
+"""Files on other machines by fsspec: inputs, and stores of workspaces, by their URLs."""
 
 import hashlib
-import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mien.batch.plan import Batch, Row, State
-from mien.batch.row import PROGRAM, attempt
 from mien.errors import UserError
 
 
@@ -40,31 +36,3 @@ def fetched(word: str, folder: Path) -> str:
         fs.get(path, str(aside), recursive=True)
         aside.rename(target)
     return str(target)
-
-
-def attempt_in_store(
-    store: str, program: Sequence[str], threads: int | None, row: Row
-) -> tuple[State | None, dict[str, bytes]]:
-    """Run a row in a temporary folder of this machine, with its workspace copied in from a store and out to it.
-
-    The store is the URL of the folder of all workspaces, such as s3://bucket/people. Returns the row's state, and its
-    thumbnails and log: path in the batch's folder -> content.
-    """
-    fs, base = store_of(store)
-    place = f"{base.rstrip('/')}/{row.name}"
-    with tempfile.TemporaryDirectory(prefix="mien-batch-") as scratch:
-        batch = Batch(Path(scratch))
-        workspace = batch.workspace(row.name)
-        if fs.exists(place):
-            workspace.parent.mkdir(parents=True)
-            fs.get(place, str(workspace), recursive=True)
-        state = attempt(batch.root, row, program or PROGRAM, threads)
-        if workspace.is_dir():
-            fs.makedirs(place, exist_ok=True)
-            fs.put(f"{workspace}/", f"{place}/", recursive=True)
-            ours = {path.relative_to(workspace).as_posix() for path in workspace.rglob("*")}
-            for gone in fs.find(place):
-                if gone.removeprefix(f"{place}/") not in ours:
-                    fs.rm_file(gone)
-        kept = [*batch.root.glob("thumbs/*"), *batch.root.glob("logs/*")]
-        return state, {path.relative_to(batch.root).as_posix(): path.read_bytes() for path in kept}

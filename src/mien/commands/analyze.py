@@ -67,7 +67,7 @@ class Command:
         parts = chosen_parts(analysis, self.parts, self.train)
         options = AnalysisOptions(self.steps, self.seconds)
         content = run_analysis(analysis, parts, run_dir, run_sequences(workspace, run_dir), folder, options)
-        left = [part.name for part in analysis.parts if part.trainings and part.name not in content["parts"]]
+        left = [part.name for part in analysis.parts if part.trains and part.name not in content["parts"]]
         if left:
             say(f"not measured, because they train: {', '.join(left)} (--train, or --parts)")
         say(f"Look at {folder / 'analysis.html'}")

@@ -93,8 +93,7 @@ class Run:
         """Run the rows, and write the results."""
         from mien.batch.drive import drive
         from mien.batch.progress import batch_progress, progress_text
-        from mien.batch.results import write_results
-        from mien.batch.wall import write_wall
+        from mien.batch.results import write_results, write_wall
         from mien.commands.batch_table import read_table
         from mien.machine.progress import say
         from mien.machine.terminal import counted
@@ -121,7 +120,7 @@ class Run:
 
     def _program(self) -> tuple[str, ...]:
         try:
-            return tuple(shlex.split(self.program))
+            return tuple(shlex.split(self.program)) or Options.program
         except ValueError as error:
             raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 

@@ -14,6 +14,7 @@ from mien.commands.train_options import check_method, listed_methods
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
+from mien.lab.synthetic.recipe import PEOPLE
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
 from mien.machine.terminal import show
 from mien.plugins import named
@@ -22,15 +23,10 @@ if TYPE_CHECKING:
     import torch
 
     StepMethod = str
+    CaptureName = str
 else:
-    StepMethod = Literal[tuple(STEP_BENCHMARKS)]
+    StepMethod, CaptureName = Literal[tuple(STEP_BENCHMARKS)], Literal[tuple(PEOPLE["references"])]
 
-CaptureName = Literal[
-    "mono-short", "mono-long", "ring-16", "ring-16-large", "beard", "long-hair", "glasses", "off-model", "mono-sides",
-    "mono-sides-long-hair",
-]  # fmt: skip
-"""The keys of `REFERENCES` in `mien.lab.synthetic`. They are written out because options are read before torch. A test
-compares them."""
 _MOST_MINUTES = 100_000
 
 

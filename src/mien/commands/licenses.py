@@ -15,8 +15,7 @@ class Command:
 
     def run(self) -> None:
         """Print the list."""
-        from mien.licences.facts import PARTS
-        from mien.licences.installed import installed_licences
+        from mien.licences import PARTS, installed_licences
 
         packages = installed_licences()
         present = {package.name.lower() for package in packages}

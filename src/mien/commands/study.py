@@ -122,15 +122,14 @@ class Tally:
     def run(self) -> None:
         """Print the percentages."""
         from mien.disk.files import write_json
-        from mien.lab.analysis.study.files import read_all_answers, read_key
-        from mien.lab.analysis.study.tally import FORMAT, VERSION, tally_content, tally_text
+        from mien.lab.analysis.study.files import TALLY, VERSION, read_all_answers, read_key, tally_content, tally_text
 
         key = read_key(self.key)
         content = tally_content(key, read_all_answers(self.answers, key))
         if self.out is not None:
-            write_json(self.out, FORMAT, VERSION, content)
+            write_json(self.out, TALLY, VERSION, content)
         if self.as_json:
-            show(json.dumps({"format": FORMAT, "version": VERSION, **content}, indent=1))
+            show(json.dumps({"format": TALLY, "version": VERSION, **content}, indent=1))
         else:
             show(tally_text(content))
 

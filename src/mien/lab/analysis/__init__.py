@@ -1,6 +1,6 @@
 """Analyses: what a method's paper measures on a trained run, beside the paper's own figures.
 
-`registry` lists the analyses and their parts, and `running` runs parts and writes analysis.json and one page. A part is
-a function from a run and options (`context`) to figures (`result`). `measuring` has what the parts measure and draw.
-Only the file of a method knows that method. `study` is apart: people compare runs.
+`registry` lists the analyses and their parts. A part is a function from a run and options (`running.Context`) to
+figures (`result`). `running` runs parts and writes analysis.json and one page. `measuring` has what parts measure and
+draw. Only the file of a method knows that method. `study` is apart: people compare runs.
 """

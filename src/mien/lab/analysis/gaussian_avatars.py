@@ -17,9 +17,9 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.analysis import measuring
-from mien.lab.analysis.context import Context, Run
 from mien.lab.analysis.measuring import draw_avatar, mean_psnr, mouth_box, mouth_camera
 from mien.lab.analysis.result import Chart, Picture, Result, Table
+from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.machine.terminal import counted

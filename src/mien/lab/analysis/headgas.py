@@ -1,9 +1,9 @@
 """The analysis of HeadGaS (Dhamo et al., ECCV 2024): the figures and the ablation table of the paper's supplement."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, get_args
 
 import numpy as np
@@ -18,7 +18,6 @@ from mien.evaluation.experiment import avatar_image, target_image
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, world_means
-from mien.lab.analysis.context import Context, Run
 from mien.lab.analysis.measuring import (
     draw_avatar,
     draw_mesh,
@@ -32,6 +31,7 @@ from mien.lab.analysis.measuring import (
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
+from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.machine.terminal import counted
@@ -76,22 +76,13 @@ class Trained:
 
 
 def trained_range(context: Context) -> Trained:
-    """The range of the run's training, from its avatar, or from its sequences if the avatar does not hold it."""
-    avatar, filmed = context.avatar, context.avatar.filmed
-    at_rest = float(_yaws(avatar.subject, context.camera)[0])
-    if filmed is not None:
-        low, high = (float(value) for value in filmed.head_angles[0])
-        count = avatar.subject.expression.shape[1]
-        return Trained(torch.from_numpy(filmed.highest[:count].copy()), (low, high), at_rest)
-    trackings = [one.tracking for one in context.sequences]
-    yaws = np.concatenate([_yaws(one.face, camera) for one in trackings for camera in one.cameras])
-    highest = torch.cat([one.face.expression for one in trackings]).amax(0)
-    return Trained(highest, (float(yaws.min()), float(yaws.max())), at_rest)
-
-
-def _yaws(face: FaceParams, camera: Camera) -> np.ndarray:
-    parts = (face.head_rotation, face.head_translation, camera.position)
-    return head_angles(*(part.detach().cpu().numpy() for part in parts))[:, 0]
+    """The range of the run's training."""
+    subject, filmed = context.avatar.subject, context.avatar.filmed
+    assert filmed is not None, "only avatars of other programs have no range, and none of them is of this method"
+    low, high = (float(value) for value in filmed.head_angles[0])
+    parts = (subject.head_rotation, subject.head_translation, context.camera.position)
+    at_rest = head_angles(*(part.detach().cpu().numpy() for part in parts))[0, 0]
+    return Trained(torch.from_numpy(filmed.highest[: subject.expression.shape[1]].copy()), (low, high), float(at_rest))
 
 
 def with_expression(face: FaceParams, index: int, value: float) -> FaceParams:
@@ -107,15 +98,14 @@ def busy_face(context: Context) -> FaceParams:
     return replace(subject, expression=subject.expression + 0.1 * bounds[:, 1])
 
 
-def _mesh_and_avatar(context: Context, face: FaceParams, camera: Camera) -> np.ndarray:
-    return side_by_side([draw_mesh(context.avatar.face_model, face, camera), draw_avatar(context.avatar, face, camera)])
+def _avatar_and_mesh(context: Context, face: FaceParams, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    return draw_avatar(context.avatar, face, camera), draw_mesh(context.avatar.face_model, face, camera)
 
 
 def basis(context: Context) -> Result:
     """The avatar with each expression alone, and the mesh with the same expression: Fig. 1."""
-    avatar, model = context.avatar, context.avatar.face_model
-    assert isinstance(avatar, HeadGas)
-    start, added = start_of_bases(avatar.subject, model)
+    assert isinstance(avatar := context.avatar, HeadGas)
+    model, (start, added) = avatar.face_model, start_of_bases(avatar.subject, avatar.face_model)
     camera = head_camera(model, start, context.camera, SIDE)
 
     def alone(index: int, value: float) -> FaceParams:
@@ -133,33 +123,37 @@ def basis(context: Context) -> Result:
     # What training reached farthest, as a share of what is drawn, comes first.
     order = sorted(range(len(names)), key=lambda i: (-min(rows[i][2] / max(rows[i][1], 1e-6), 1), -rows[i][4], i))
     shown = [index for index in order if rows[index][1] > 0][:12]
-    pairs = [
-        labeled(_mesh_and_avatar(context, alone(index, rows[index][1]), camera), f"{names[index]} {rows[index][1]:g}")
-        for index in shown
-    ]
-    if shown:
-        write_video(context.folder / "basis.mp4", _basis_film(context, camera, shown, alone), _FPS)
+
+    def pair(index: int, value: float, digits: str) -> np.ndarray:
+        drawn = _avatar_and_mesh(context, alone(index, value), camera)
+        return labeled(side_by_side(drawn[::-1]), f"{names[index]} {value:{digits}}")
+
+    def film() -> Iterator[np.ndarray]:
+        for index, frame in product(shown, range(16)):
+            most = min(1.0, float(model.expression_bounds[index, 1]))
+            yield pair(index, most * math.sin(math.pi * frame / 16) ** 2, ".2f")
+
+    write_video(context.folder / "basis.mp4", film(), _FPS)
     seen = sum(row[2] >= 0.5 * row[1] for row in rows if row[1] > 0)
-    columns = ("name", "value", "largest_in_training", "picture_change", "mesh_moves_mm")
-    heading = (
-        "Expression",
-        "Drawn at",
-        "Largest in training",
-        "Change of the picture, of 255",
-        "Mesh moves at most, mm",
-    )
+    columns = {
+        "name": "Expression",
+        "value": "Drawn at",
+        "largest_in_training": "Largest in training",
+        "picture_change": "Change of the picture, of 255",
+        "mesh_moves_mm": "Mesh moves at most, mm",
+    }
     base = "added to the person at rest" if added else "alone"
     caption = f"The 12 expressions that training reached farthest, each {base}: the mesh, and the avatar."
-    told = "The same expressions, one after the other, from nothing to their value and back."
+    grid = picture_grid([pair(index, rows[index][1], "g") for index in shown], 3)
     return Result(
         {"neutral_added": bool(added), "seen": seen, "rows": [dict(zip(columns, row, strict=True)) for row in rows]},
         [
             f"Training reached at least half of the drawn value in {seen} of {len(rows)} expressions; the others are "
             "extrapolated."
         ],
-        [Table(heading, [rows[index] for index in order])],
-        pictures=[Picture("basis", picture_grid(pairs, 3), caption)] if shown else [],
-        films=[Film("basis.mp4", told)] if shown else [],
+        [Table(list(columns.values()), [rows[index] for index in order])],
+        pictures=[Picture("basis", grid, caption)],
+        films=[Film("basis.mp4", "The same expressions, one after the other, from nothing to their value and back.")],
         notes=[
             "Each expression is drawn at 1, or at the bound of the face model if that is smaller. The other "
             + ("coefficients are those of the person at rest." if added else "coefficients are 0."),
@@ -168,17 +162,6 @@ def basis(context: Context) -> Result:
             "What expressions have in common along them looks alike.",
         ],
     )
-
-
-def _basis_film(
-    context: Context, camera: Camera, shown: list[int], alone: Callable[[int, float], FaceParams]
-) -> Iterator[np.ndarray]:
-    model = context.avatar.face_model
-    for index in shown:
-        for frame in range(16):
-            value = min(1.0, float(model.expression_bounds[index, 1])) * math.sin(math.pi * frame / 16) ** 2
-            picture = _mesh_and_avatar(context, alone(index, value), camera)
-            yield labeled(picture, f"{model.expression_names[index]} {value:.2f}")
 
 
 def start_of_bases(subject: FaceParams, model: FaceModel) -> tuple[FaceParams, int]:
@@ -308,8 +291,7 @@ def _expressed(context: Context, index: int, value: float) -> tuple[np.ndarray, 
     """The avatar at rest but for one expression, and the mesh."""
     avatar, model = context.avatar, context.avatar.face_model
     camera = head_camera(model, avatar.subject, context.camera, SIDE)
-    face = with_expression(avatar.subject, index, value)
-    return draw_avatar(avatar, face, camera), draw_mesh(model, face, camera)
+    return _avatar_and_mesh(context, with_expression(avatar.subject, index, value), camera)
 
 
 def _changes(context: Context, index: int, most: float) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.scoring import score_pictures
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.lab.analysis.context import Run
+from mien.lab.analysis.running import Run
 from mien.machine.system import peak_memory_mb
 from mien.machine.threads import one_torch_thread
 from mien.media.pictures import WHITE, Box, to_uint8

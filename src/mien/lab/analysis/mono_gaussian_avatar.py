@@ -18,7 +18,6 @@ from mien.avatar.settings import Progress
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import psnr
-from mien.lab.analysis.context import Context, Run
 from mien.lab.analysis.measuring import (
     head_picture,
     held_out_scores,
@@ -28,6 +27,7 @@ from mien.lab.analysis.measuring import (
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Picture, Result, Table
+from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.terminal import counted
 from mien.media.pictures import side_by_side

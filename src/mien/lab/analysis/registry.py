@@ -1,7 +1,7 @@
 """The analyses, by the name that the command line takes. Needs no torch: a part's function is imported when it runs.
 
 A new analysis is an entry here, and a file named after its method. The file has a function for each part, from a
-`Context` to a `Result`.
+`mien.lab.analysis.running.Context` to a `Result`.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,8 @@ class Part:
 
     name: str
     title: str
-    trainings: int = 0
-    """Number of short trainings, of `steps` each. Parts with trainings run only if they are asked for."""
+    trains: bool = False
+    """Whether it trains, for `steps` each time. Such a part runs only if it is asked for."""
     timed: bool = False
     """Whether the result depends on the seconds of a row and on the number of threads."""
 
@@ -54,39 +54,41 @@ class Analysis:
         return "; ".join(f"{part.name} – {part.title}" for part in self.parts)
 
 
-_GAUSSIAN_AVATARS = Analysis(
-    "gaussian_avatars",
-    "GaussianAvatars (Qian et al., CVPR 2024), supplement",
-    (
-        Part("growth", "Gaussians and step time over training (Fig. 3)"),
-        Part("speed", "Drawing speed and memory (Table 3)", timed=True),
-        Part("teeth", "Teeth: the Gaussians on the teeth's triangles (Fig. 1)"),
-        Part("teeth-trained", "Teeth: trained with and without the teeth's triangles (Fig. 1)", trainings=2),
-        Part("scale", "The threshold of the scale loss (section C)", trainings=2, timed=True),
+_ALL = (
+    Analysis(
+        "gaussian_avatars",
+        "GaussianAvatars (Qian et al., CVPR 2024), supplement",
+        (
+            Part("growth", "Gaussians and step time over training (Fig. 3)"),
+            Part("speed", "Drawing speed and memory (Table 3)", timed=True),
+            Part("teeth", "Teeth: the Gaussians on the teeth's triangles (Fig. 1)"),
+            Part("teeth-trained", "Teeth: trained with and without the teeth's triangles (Fig. 1)", trains=True),
+            Part("scale", "The threshold of the scale loss (section C)", trains=True, timed=True),
+        ),
+    ),
+    Analysis(
+        "headgas",
+        "HeadGaS (Dhamo et al., ECCV 2024), supplement",
+        (
+            Part("basis", "What the bases learned: one expression at a time, beside the mesh (Fig. 1)"),
+            Part("layers", "Gaussians removed from near to far (Fig. 2)"),
+            Part("beyond", "Beyond the expressions and the views of training (Fig. 3)"),
+            Part("sizes", "Time of a frame against the size of the picture (Fig. 4)", timed=True),
+            Part("ablations", "The ablations, trained alike (Table 1)", trains=True, timed=True),
+        ),
+    ),
+    Analysis(
+        "mono_gaussian_avatar",
+        "MonoGaussianAvatar (Chen et al., SIGGRAPH 2024), supplement",
+        (
+            Part("times", "Time of training and of a frame (Table 4)", timed=True),
+            Part("convergence", "Held-out pictures during a training (Fig. 13)", trains=True),
+            Part("resolutions", "Training at two resolutions (A.1)", trains=True),
+            Part("diversity", "Fewer and less varied frames (A.4)", trains=True),
+        ),
     ),
 )
-_HEADGAS = Analysis(
-    "headgas",
-    "HeadGaS (Dhamo et al., ECCV 2024), supplement",
-    (
-        Part("basis", "What the bases learned: one expression at a time, beside the mesh (Fig. 1)"),
-        Part("layers", "Gaussians removed from near to far (Fig. 2)"),
-        Part("beyond", "Beyond the expressions and the views of training (Fig. 3)"),
-        Part("sizes", "Time of a frame against the size of the picture (Fig. 4)", timed=True),
-        Part("ablations", "The ablations, trained alike (Table 1)", trainings=6, timed=True),
-    ),
-)
-_MONO_GAUSSIAN_AVATAR = Analysis(
-    "mono_gaussian_avatar",
-    "MonoGaussianAvatar (Chen et al., SIGGRAPH 2024), supplement",
-    (
-        Part("times", "Time of training and of a frame (Table 4)", timed=True),
-        Part("convergence", "Held-out pictures during a training (Fig. 13)", trainings=1),
-        Part("resolutions", "Training at two resolutions (A.1)", trainings=2),
-        Part("diversity", "Fewer and less varied frames (A.4)", trainings=3),
-    ),
-)
-ANALYSES = {one.method.replace("_", "-"): one for one in (_GAUSSIAN_AVATARS, _HEADGAS, _MONO_GAUSSIAN_AVATAR)}
+ANALYSES = {one.method.replace("_", "-"): one for one in _ALL}
 
 
 def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[Part]:
@@ -96,5 +98,5 @@ def chosen_parts(analysis: Analysis, names: Sequence[str], train: bool) -> list[
         if name not in known:
             raise UserError(f"--parts {name}: no such part; there are: {', '.join(known)}")
     if names:
-        return [part for part in analysis.parts if part.name in names or (train and part.trainings)]
-    return [part for part in analysis.parts if train or not part.trainings]
+        return [part for part in analysis.parts if part.name in names or (train and part.trains)]
+    return [part for part in analysis.parts if train or not part.trains]

@@ -91,11 +91,6 @@ class Result:
         }
 
 
-def file_names(part: Mapping[str, Any]) -> list[str]:
-    """The names of all files that the json of a part names."""
-    return [entry["file"] for kind in ("charts", "pictures", "films") for entry in part[kind]]
-
-
 def section_html(title: str, part: Mapping[str, Any], folder: Path) -> Markup:
     """The section of a part on the page, from its json and from the pictures and films in `folder`."""
     return render(
@@ -104,7 +99,10 @@ def section_html(title: str, part: Mapping[str, Any], folder: Path) -> Markup:
         findings=part["findings"],
         tables=[_table(table) for table in part["tables"]],
         charts=[_card(entry) for entry in part["charts"]],
-        pictures=[_picture(entry["caption"], inside(folder, entry["file"])) for entry in part["pictures"]],
+        pictures=[
+            PagePicture(entry["caption"], data_uri("image/png", read_bytes(inside(folder, entry["file"]), 64 << 20)))
+            for entry in part["pictures"]
+        ],
         films=[video_of(inside(folder, entry["file"]), folder, entry["caption"]) for entry in part["films"]],
         notes=part["notes"],
     )
@@ -138,7 +136,3 @@ def _text(cell: str | float | int | None) -> str:
     if cell is None:
         return "–"
     return cell if isinstance(cell, str) else f"{cell:,}"
-
-
-def _picture(caption: str, path: Path) -> PagePicture:
-    return PagePicture(caption, data_uri("image/png", read_bytes(path, 64 << 20)))

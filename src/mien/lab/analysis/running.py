@@ -1,28 +1,148 @@
-"""Run the chosen parts of an analysis, and write analysis.json, a file for each chart and picture, and the page."""
+"""A trained run, short trainings of the same with something changed, and how the parts of an analysis are run.
 
+`run_analysis` writes analysis.json, a file for each chart and picture, and the page.
+"""
+
+import hashlib
 import json
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Bool
+from torch import Tensor
+
 import mien
 from mien import _native
+from mien.avatar.avatar import Avatar
+from mien.avatar.files import load_avatar
+from mien.avatar.settings import MethodConfig
+from mien.camera import Camera
+from mien.disk.config import decode, encode
 from mien.disk.files import expect_whole, file_digest, read_json, write_atomically, write_json
 from mien.disk.inside import check_tree, inside
 from mien.disk.locks import hold
 from mien.errors import UserError
-from mien.lab.analysis.context import Context, digest_of
+from mien.evaluation.experiment import Experiment
+from mien.evaluation.load import load_experiments
+from mien.face.model import FaceModel
 from mien.lab.analysis.registry import Analysis, AnalysisOptions, Part
-from mien.lab.analysis.result import file_names, section_html
+from mien.lab.analysis.result import section_html
 from mien.machine.progress import say
 from mien.pages.pages import render
 from mien.plugins import named
-from mien.training.run import read_run_config, read_training_summary
+from mien.training.footage.sequence import Sequence as TrainedSequence
+from mien.training.footage.sequence import read_sequence
+from mien.training.run import check_data, read_curves, read_run_config, read_training_summary, run_camera
+from mien.training.settings import TrainSettings
+from mien.training.trainer import train
 
 _FORMAT, _VERSION = "mien.analysis", 1
 _REMEDY = "delete it and run the same `mien analyze` again"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished run. Everything is read at its first use."""
+
+    run_dir: Path
+    sequence_dirs: tuple[Path, ...]
+    """The folders of the run's sequences, in its order. They may be missing; not every part needs them."""
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The content of config.json."""
+        return read_run_config(self.run_dir)
+
+    @cached_property
+    def settings(self) -> TrainSettings:
+        """The settings that the run was trained with."""
+        return decode(TrainSettings, self.config["settings"], str(self.run_dir / "config.json"), "train it again")
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """`steps, seconds, gaussians, step_ms_median, peak_memory_mb`."""
+        return read_training_summary(self.run_dir)
+
+    @cached_property
+    def curves(self) -> dict[str, Any]:
+        """Step, gaussians, step_ms and others over the training, each a numpy array."""
+        return read_curves(self.run_dir)
+
+    @cached_property
+    def avatar(self) -> Avatar:
+        """The trained avatar."""
+        return load_avatar(self.run_dir)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The first camera of the training."""
+        return run_camera(self.run_dir)
+
+    @cached_property
+    def sequences(self) -> list[TrainedSequence]:
+        """The sequences of the training."""
+        sequences = [read_sequence(folder) for folder in self.sequence_dirs]
+        check_data(self.run_dir, {sequence.name: sequence.tracking for sequence in sequences})
+        return sequences
+
+    @cached_property
+    def experiment(self) -> Experiment | None:
+        """The first protocol with held-out frames; None if nothing was held out."""
+        return next(iter(load_experiments(self.run_dir, self.sequence_dirs).values()), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Context(Run):
+    """The run that is analysed, the options, and the folder of the analysis."""
+
+    folder: Path
+    """Pictures and films are written here, short trainings below `runs/`."""
+    options: AnalysisOptions
+
+    def train(
+        self,
+        name: str,
+        config: MethodConfig,
+        face_model: FaceModel | None = None,
+        resolution: int | None = None,
+        timesteps: Sequence[Bool[Tensor, " t"]] | None = None,
+    ) -> Run:
+        """Train the run's sequences again for `options.steps` steps, with something changed.
+
+        A stopped training continues, and a finished one is only read. `resolution` is the longer side of the training
+        pictures, in pixels, and `timesteps` are those of each sequence that may be trained on; None is all.
+        """
+        model = face_model or self.avatar.face_model
+        settings = replace(self.settings, steps=self.options.steps, checkpoint_every=250)
+        if resolution is not None:
+            settings = replace(settings, resolution=resolution)
+        key = [encode(config), encode(settings), self.config["data"], model.content_hash]
+        key += [] if timesteps is None else [[one.nonzero()[:, 0].tolist() for one in timesteps]]
+        run_dir = self.folder / "runs" / f"{name}-{self.options.steps}-{_digest_of(key)[:8]}"
+        trackings = [
+            replace(one.tracking, face_model=model.name, face_model_hash=model.content_hash) for one in self.sequences
+        ]
+        if timesteps is not None:
+            trackings = [replace(one, valid=one.valid & some) for one, some in zip(trackings, timesteps, strict=True)]
+        sequences = [replace(one, tracking=own) for one, own in zip(self.sequences, trackings, strict=True)]
+        train(sequences, model, config, settings, run_dir)
+        return Run(run_dir, self.sequence_dirs)
+
+    def say_how_long(self, part: str, trainings: int) -> None:
+        """Report beforehand how long the short trainings of a part take, from the pace of the run."""
+        _ = self.sequences
+        pace = self.summary["seconds"] / max(self.summary["steps"], 1)
+        minutes = trainings * self.options.steps * pace / 60
+        about = f"{minutes:.0f} min" if minutes >= 2 else f"{60 * minutes:.0f} s"
+        say(
+            f"{part}: {trainings} trainings of {self.options.steps:,} steps each, about {about} in all at the pace "
+            "of this run; a stopped command continues, and what is trained is not trained again"
+        )
 
 
 def run_analysis(
@@ -38,7 +158,12 @@ def run_analysis(
     A part that was computed before, for the same avatar and options, is kept. Each part is written once it is done.
     """
     options.check()
-    check_method(analysis, run_dir)
+    method = read_run_config(run_dir)["method"]["kind"]
+    if method != analysis.method:
+        raise UserError(
+            f"{run_dir}: is a run of {method}, not of {analysis.method}; choose a run of {analysis.method} with "
+            f"--run NAME, or train one with `mien train --method {analysis.method}`"
+        )
     read_training_summary(run_dir)
     check_tree(run_dir)
     check_tree(folder)
@@ -57,7 +182,8 @@ def run_analysis(
         }
         context = Context(run_dir, tuple(sequence_dirs), folder, options)
         for part in parts:
-            key = _key(part, avatar, options)
+            timed = [options.seconds, _native.thread_count()] if part.timed else None
+            key = _digest_of([part.name, avatar, options.steps if part.trains else None, timed])
             if content["parts"].get(part.name, {}).get("key") == key:
                 say(f"{part.name}: measured before")
             else:
@@ -67,54 +193,38 @@ def run_analysis(
                 write_json(record, _FORMAT, _VERSION, content)
             for finding in content["parts"][part.name]["findings"]:
                 say(f"{part.name}: {finding}")
-        with expect_whole(record, _REMEDY):
-            page = _page(analysis, content, folder)
+        shown = [one for one in analysis.parts if one.name in content["parts"]]
+        page = render(
+            "lab/analysis/templates/analysis.html",
+            title=f"{run_dir.name} · {analysis.method}",
+            paper=analysis.paper,
+            version=mien.__version__,
+            command=shlex.join(["mien", *sys.argv[1:]]),
+            sections=[section_html(one.title, content["parts"][one.name], folder) for one in shown],
+        )
         write_json(record, _FORMAT, _VERSION, content)
         write_atomically(folder / "analysis.html", lambda aside: aside.write_text(page, encoding="utf-8"))
     return content
-
-
-def check_method(analysis: Analysis, run_dir: Path) -> None:
-    """Check that a run is of the method of an analysis."""
-    method = read_run_config(run_dir)["method"]["kind"]
-    if method != analysis.method:
-        raise UserError(
-            f"{run_dir}: is a run of {method}, not of {analysis.method}; choose a run of {analysis.method} with "
-            f"--run NAME, or train one with `mien train --method {analysis.method}`"
-        )
-
-
-def _key(part: Part, avatar: str, options: AnalysisOptions) -> str:
-    """A hash of everything that the result of a part depends on."""
-    steps = options.steps if part.trainings else None
-    timed = [options.seconds, _native.thread_count()] if part.timed else None
-    return digest_of([part.name, avatar, steps, timed])
 
 
 def _known(record: Path, analysis: Analysis, avatar: str) -> dict[str, Any]:
     """The parts of this avatar that were computed before, and whose files are all there."""
     if not record.is_file():
         return {}
-    content = read_json(record, _FORMAT, _VERSION, remedy=_REMEDY)
+    content, folder, found = read_json(record, _FORMAT, _VERSION, remedy=_REMEDY), record.parent, {}
     with expect_whole(record, _REMEDY):
         if (content["method"], content["avatar"]) != (analysis.method, avatar):
             return {}
-        kept = {part.name: content["parts"][part.name] for part in analysis.parts if part.name in content["parts"]}
-        folder = record.parent
-        return {
-            name: part
-            for name, part in kept.items()
-            if all(inside(folder, file).is_file() for file in file_names(part))
-        }
+        for part in (one.name for one in analysis.parts if one.name in content["parts"]):
+            own = content["parts"][part]
+            files = [entry["file"] for kind in ("charts", "pictures", "films") for entry in own[kind]]
+            if all(inside(folder, file).is_file() for file in files):
+                section_html(part, own, folder)  # stumbles over whatever is damaged
+                found[part] = own
+    return found
 
 
-def _page(analysis: Analysis, content: dict[str, Any], folder: Path) -> str:
-    parts = content["parts"]
-    return render(
-        "lab/analysis/templates/analysis.html",
-        title=f"{content['run']} · {analysis.method}",
-        paper=content["paper"],
-        version=content["mien"],
-        command=shlex.join(["mien", *content["command_line"][1:]]),
-        sections=[section_html(one.title, parts[one.name], folder) for one in analysis.parts if one.name in parts],
-    )
+def _digest_of(key: Any) -> str:
+    """A hash of json, of this version of mien and of the instruction set, as hex digits."""
+    text = json.dumps([key, mien.__version__, _native.rasterize_isa()], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -6,8 +6,8 @@ Here are the benchmarks of training steps by method. This needs no torch: they i
 _ROOM = "mien.lab.benchmarking"
 STEP_BENCHMARKS = {
     "gaussian_avatars": f"{_ROOM}.train_step:train_step_suite",
-    "headgas": f"{_ROOM}.headgas_step:headgas_suite",
-    "mono_gaussian_avatar": f"{_ROOM}.mono_step:mono_suite",
+    "headgas": f"{_ROOM}.method_steps:headgas_suite",
+    "mono_gaussian_avatar": f"{_ROOM}.method_steps:mono_suite",
 }
 """Method -> "MODULE:FUNCTION", which takes the seconds for each row, measures on the CPU and yields rows."""
 GPU_BENCHMARKS = {"gaussian_avatars": f"{_ROOM}.train_step:gpu_rows"}

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mien import runtime
 from mien.avatar.avatar import Avatar
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.camera import Camera
@@ -94,12 +93,6 @@ def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:
     with torch.no_grad():
         gaussians = avatar.pose(face[0]).gaussians.timestep(0)
         rasterize(gaussians, camera, gaussians.means.new_ones(3))
-
-
-def runtime_frame(avatar: runtime.Avatar, face: FaceParams) -> None:
-    """Pose and render one picture as `mien.runtime` does."""
-    parts = (face.expression, face.joints, face.head_rotation, face.head_translation)
-    avatar.render(runtime.pose(avatar.portable.baked, runtime.Face(*(part[0].numpy() for part in parts))))
 
 
 def training_case(

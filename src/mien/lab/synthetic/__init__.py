@@ -6,8 +6,8 @@ The order of the files:
 - `motion` makes the face parameters of every timestep from the recipe's script; `posing` turns them into vertices.
 - `subject` builds the person on the face model: `anatomy` measures the head; `skin`, `hair`, `facial_hair` and
   `accessories` cover it; `off_model` bends it beyond the face model.
-- `painter` draws the posed person with the materials of `shading` in the light of `light`. `arithmetic` has the noise
-  and the ramps of all of these.
+- `painter` draws the posed person with the light and the materials of `shading`. `arithmetic` has the noise and the
+  ramps of all of these.
 - `scene` joins them into frames; `captures` writes whole captures; `truth` stores what is known exactly.
 - `detector_calibration` measures a landmark detector on drawn people.
 """

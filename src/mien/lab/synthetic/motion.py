@@ -16,7 +16,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.synthetic.arithmetic import smoothstep
 from mien.lab.synthetic.posing import rest_joints
-from mien.lab.synthetic.recipe import Segment, SegmentKind, SyntheticRecipe
+from mien.lab.synthetic.recipe import PEOPLE, Segment, SegmentKind, SyntheticRecipe
 from mien.machine import exact
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
@@ -25,43 +25,6 @@ _TURNS = ((0.0, 1.0), (0.0, -1.0), (0.7, 0.0), (-0.8, 0.0), (0.4, 0.7), (-0.4, -
 
 _Tracks = dict[str, np.ndarray]
 """Coefficients over time by name. A name without a side means both sides."""
-
-_VISEMES: dict[str, Mapping[str, float]] = {
-    "rest": {},
-    "a": {"jawOpen": 0.4, "mouthLowerDown": 0.3, "mouthUpperUp": 0.3},
-    "e": {"jawOpen": 0.2, "mouthStretch": 0.35, "mouthSmile": 0.15, "mouthLowerDown": 0.3, "mouthUpperUp": 0.3},
-    "i": {"jawOpen": 0.1, "mouthSmile": 0.3, "mouthStretch": 0.3, "mouthLowerDown": 0.3, "mouthUpperUp": 0.35},
-    "o": {"jawOpen": 0.3, "mouthFunnel": 0.5},
-    "u": {"jawOpen": 0.12, "mouthPucker": 0.55, "mouthFunnel": 0.2},
-    "m": {"mouthClose": 0.03, "mouthPress": 0.35, "mouthRollLower": 0.15, "mouthRollUpper": 0.15},
-    "f": {"jawOpen": 0.06, "mouthRollLower": 0.25, "mouthUpperUp": 0.2},
-    "s": {"jawOpen": 0.06, "mouthStretch": 0.2, "mouthLowerDown": 0.25, "mouthUpperUp": 0.1},
-}
-_GESTURES: dict[str, Mapping[str, float]] = {
-    "smile": {
-        "mouthSmile": 0.7, "cheekSquint": 0.45, "eyeSquint": 0.3, "mouthUpperUp": 0.3, "mouthLowerDown": 0.1,
-        "mouthDimple": 0.2,
-    },
-    "raise": {"browInnerUp": 0.7, "browOuterUp": 0.7, "eyeWide": 0.3},
-    "frown": {"browDown": 0.7, "eyeSquint": 0.25, "mouthFrown": 0.2},
-    "worry": {"browInnerUp": 0.75, "mouthFrown": 0.35},
-}  # fmt: skip
-_POSED: dict[str, Mapping[str, float]] = {
-    "mouth wide open": {"jawOpen": 0.85},
-    "broad smile": {"mouthSmile": 1.0, "cheekSquint": 0.8, "eyeSquint": 0.5, "mouthUpperUp": 0.5, "jawOpen": 0.12},
-    "pucker": {"mouthPucker": 1.0},
-    "brows up": {"browInnerUp": 1.0, "browOuterUp": 1.0, "eyeWide": 0.7},
-    "anger": {"browDown": 1.0, "eyeSquint": 0.5, "noseSneer": 0.7, "mouthPress": 0.5},
-    "mouth left": {"mouthLeft": 0.8, "jawLeft": 0.4},
-    "mouth right": {"mouthRight": 0.8, "jawRight": 0.4},
-    "puffed cheeks": {"cheekPuff": 1.0, "mouthPress": 0.4},
-    "sadness": {"browInnerUp": 0.9, "mouthFrown": 1.0, "mouthShrugLower": 0.6},
-    "funnel": {"mouthFunnel": 1.0, "jawOpen": 0.25},
-    "half a smile": {"mouthSmileLeft": 0.9, "mouthDimpleLeft": 0.5},
-    "wink": {"eyeBlinkRight": 1.0, "cheekSquintRight": 0.7, "mouthSmileRight": 0.4},
-    "eyes shut tight": {"eyeBlink": 1.0, "eyeSquint": 0.9, "cheekSquint": 0.8, "browDown": 0.5},
-    "rolled lips": {"mouthRollLower": 0.8, "mouthRollUpper": 0.8},
-}
 
 
 @dataclass(frozen=True)
@@ -95,7 +58,7 @@ def _lay_out(recipe: SyntheticRecipe) -> tuple[_Span, ...]:
 
 def _moving_clock(times: np.ndarray, spans: tuple[_Span, ...]) -> np.ndarray:
     """Return the seconds of motion so far: a clock that stops while the script is still."""
-    speed = 1 - sum((span.window(times) for span in spans if span.kind == "still"), np.zeros_like(times))
+    speed = 1 - _share_of("still", times, spans)
     step = float(times[1] - times[0]) if len(times) > 1 else 0.0
     return np.concatenate([[0.0], np.cumsum(speed[:-1]) * step])
 
@@ -145,9 +108,14 @@ def _add(tracks: _Tracks, shape: Mapping[str, float], weight: np.ndarray, factor
         tracks[name] = tracks.get(name, 0) + value * weight * (1 if factors is None else factors[name])
 
 
+def _bump(times: np.ndarray, start: float, high: float, down: float, end: float) -> np.ndarray:
+    """Return a rise from `start` to `high` and a fall from `down` to `end`, 0..1."""
+    return smoothstep(start, high, times) - smoothstep(down, end, times)
+
+
 def _add_speech(random: np.random.Generator, times: np.ndarray, span: _Span, tracks: _Tracks) -> None:
     """Add phrases of one to two seconds: visemes every 0.12 to 0.24 s that blend into each other, then a pause."""
-    names = [name for name in _VISEMES if name != "rest"]
+    names = [name for name in PEOPLE["visemes"] if name != "rest"]
     keys, shapes, loudness = [span.start], ["rest"], [1.0]
     clock = span.start + random.uniform(0.1, 0.4)
     while clock < span.end + 1:
@@ -165,7 +133,7 @@ def _add_speech(random: np.random.Generator, times: np.ndarray, span: _Span, tra
         before, now = keys[max(index - 1, 0)], keys[index]
         after = keys[min(index + 1, len(keys) - 1)]
         weight = smoothstep(before - 1e-6, now, times) * (1 - smoothstep(now, after + 1e-6, times))
-        _add(tracks, _VISEMES[shape], loud * weight)
+        _add(tracks, PEOPLE["visemes"][shape], loud * weight)
 
 
 def _add_gestures(random: np.random.Generator, times: np.ndarray, span: _Span, tracks: _Tracks) -> None:
@@ -174,12 +142,10 @@ def _add_gestures(random: np.random.Generator, times: np.ndarray, span: _Span, t
     clock = span.start + random.uniform(0.2, 0.8)
     while clock < span.end:
         if not order:
-            order = [*random.permutation([*_GESTURES, "smile"])]
+            order = [*random.permutation([*PEOPLE["gestures"], "smile"])]
         rise, hold, fall = random.uniform(0.25, 0.45), random.uniform(0.3, 0.9), random.uniform(0.35, 0.6)
-        weight = smoothstep(clock, clock + rise, times) - smoothstep(
-            clock + rise + hold, clock + rise + hold + fall, times
-        )
-        _add(tracks, _GESTURES[order.pop()], random.uniform(0.7, 1.0) * weight)
+        weight = _bump(times, clock, clock + rise, clock + rise + hold, clock + rise + hold + fall)
+        _add(tracks, PEOPLE["gestures"][order.pop()], random.uniform(0.7, 1.0) * weight)
         clock += rise + hold + 0.6 * fall + random.uniform(0.0, 0.5)
 
 
@@ -188,11 +154,11 @@ def _add_posed(random: np.random.Generator, times: np.ndarray, span: _Span, trac
     order: list[str] = []
     clock = span.start + 0.2
     while clock < span.end - 1.0:
-        order = order or [*random.permutation([*_POSED])]
+        order = order or [*random.permutation([*PEOPLE["posed"]])]
         rise, hold, fall = random.uniform(0.3, 0.5), random.uniform(0.4, 0.9), random.uniform(0.3, 0.5)
         down = clock + rise + hold
-        weight = smoothstep(clock, clock + rise, times) - smoothstep(down, down + fall, times)
-        _add(tracks, _POSED[order.pop()], random.uniform(0.8, 1.0) * weight)
+        weight = _bump(times, clock, clock + rise, down, down + fall)
+        _add(tracks, PEOPLE["posed"][order.pop()], random.uniform(0.8, 1.0) * weight)
         clock = down + fall + random.uniform(0.0, 0.25)
 
 
@@ -203,10 +169,8 @@ def _add_blinks(random: np.random.Generator, times: np.ndarray, spans: tuple[_Sp
     while clock < times[-1]:
         length = random.uniform(0.18, 0.3)
         if not any(span.kind == "still" and span.start < clock + length and clock < span.end for span in spans):
-            weight = smoothstep(clock, clock + 0.35 * length, times) - smoothstep(
-                clock + 0.45 * length, clock + length, times
-            )
-            closed = np.maximum(closed, weight)
+            bump = _bump(times, clock, clock + 0.35 * length, clock + 0.45 * length, clock + length)
+            closed = np.maximum(closed, bump)
         clock += random.uniform(1.2, 3.5)
     tracks["eyeBlink"] = np.maximum(tracks.get("eyeBlink", 0), closed)
 

@@ -15,7 +15,7 @@ from mien.lab.synthetic.posing import project
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.subject import Material, PosedSubject, Subject, opaque_vertices
 from mien.machine import exact
-from mien.render.mesh import MeshFragments, interpolate, rasterize_mesh
+from mien.render.mesh import MeshFragments, interpolate, rasterize_mesh, sample_texture
 
 
 def draw(
@@ -99,7 +99,7 @@ def _paint_skin(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
     def paint(block: np.ndarray) -> np.ndarray:
         values = canvas.interpolate(block, attributes, _model_faces(canvas))
         uv = canvas.interpolate(block, subject.textures.uv, uv_faces)
-        channels = shading.look_up(subject.textures.channels, uv)
+        channels = sample_texture(torch.from_numpy(subject.textures.channels), torch.from_numpy(uv)[None])[0].numpy()
         views = canvas.views(canvas.pixels[block])
         return shading.shade_skin(channels, values[:, :3], values[:, 3:], views, canvas.light)
 

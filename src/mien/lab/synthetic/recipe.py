@@ -1,8 +1,12 @@
 """Recipes of synthetic captures: what a capture shows, and the recipes with names."""
 
+import tomllib
 from dataclasses import dataclass, field
-from typing import Literal
+from importlib.resources import files
+from typing import Any, Literal
 
+PEOPLE: dict[str, Any] = tomllib.loads(files("mien.lab.synthetic").joinpath("people.toml").read_text(encoding="utf-8"))
+"""The tables of the drawn people: expressions, colours, shared recipes and reference captures."""
 SIDES: dict[str, tuple[float, float]] = {
     **{f"{side}-{angle}": (sign * angle, 0.0) for angle in (15, 30, 45, 60, 90)
        for side, sign in (("left", 1.0), ("right", -1.0))},

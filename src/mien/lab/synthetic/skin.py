@@ -12,14 +12,9 @@ from mien.lab.synthetic import anatomy as places
 from mien.lab.synthetic.anatomy import SIDES, Anatomy, FrontView, face_view
 from mien.lab.synthetic.arithmetic import SolidNoise, smoothstep
 from mien.lab.synthetic.facial_hair import beard_zone
-from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.recipe import PEOPLE, SyntheticRecipe
 from mien.machine import exact
 from mien.render.mesh import interpolate, rasterize_mesh
-
-_TONES = np.array(
-    [[0.66, 0.40, 0.29], [0.60, 0.345, 0.24], [0.50, 0.27, 0.175], [0.36, 0.18, 0.11], [0.20, 0.092, 0.052]], np.float32
-)
-"""Linear albedo of a cheek, from light to dark skin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +48,7 @@ def paint_skin(
     random, noise = np.random.default_rng([seed, 5]), SolidNoise(seed + 5)
     uv = _fitted_uv(anatomy)
     canvas, positions = _canvas(anatomy, uv, recipe.texture_size)
-    tone = _TONES[random.choice(len(_TONES), p=[0.3, 0.3, 0.2, 0.12, 0.08])]
+    tone = np.array(PEOPLE["colors"]["skin"][random.choice(5, p=[0.3, 0.3, 0.2, 0.12, 0.08])], np.float32)
     canvas.albedo[:] = tone * np.exp(random.normal(0, 0.04))
     view = face_view(anatomy)
     _paint_zones(canvas, anatomy, noise)

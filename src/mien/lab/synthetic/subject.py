@@ -14,26 +14,15 @@ from mien.lab.synthetic.accessories import Glasses, RigidMesh, build_glasses, bu
 from mien.lab.synthetic.anatomy import CHIN, SIDES, Anatomy, measure_anatomy
 from mien.lab.synthetic.facial_hair import Lashes, RootedStrands, SkinStrands, grow_beard, grow_brows
 from mien.lab.synthetic.hair import DrapedStrands, HeadPose, Strands, grow_long_hair, grow_short_hair, ribbon_faces
-from mien.lab.synthetic.light import Lighting, Visibility, compute_visibility, studio_lighting
 from mien.lab.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions
-from mien.lab.synthetic.recipe import SyntheticRecipe
+from mien.lab.synthetic.recipe import PEOPLE, SyntheticRecipe
+from mien.lab.synthetic.shading import Lighting, Visibility, compute_visibility, studio_lighting
 from mien.lab.synthetic.skin import SkinTextures, paint_skin
 from mien.machine import exact
 
 Hair = Strands | DrapedStrands | RootedStrands | SkinStrands | Lashes
 Material = IntEnum("Material", ("SKIN", "EYE", "TEETH", "MOUTH", "HAIR", "SHIRT", "FRAME"), start=0)
-
-_HAIR_COLORS = np.array(
-    [[0.018, 0.012, 0.009], [0.045, 0.026, 0.016], [0.10, 0.055, 0.028], [0.20, 0.12, 0.058], [0.13, 0.045, 0.02]],
-    np.float32,
-)
-_IRIS_COLORS = np.array(
-    [[0.10, 0.045, 0.018], [0.16, 0.085, 0.03], [0.10, 0.17, 0.24], [0.12, 0.16, 0.10], [0.17, 0.20, 0.22]], np.float32
-)
-_SHIRT_COLORS = np.array(
-    [[0.05, 0.08, 0.15], [0.25, 0.06, 0.06], [0.10, 0.16, 0.13], [0.35, 0.33, 0.30], [0.045, 0.045, 0.05]], np.float32
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +81,14 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     """Build a person from a seed: paint the skin, add hair and clothes, and compute what shades what."""
     random = np.random.default_rng([seed, 6])
     anatomy = measure_anatomy(model, identity)
-    hair_color = _HAIR_COLORS[random.integers(len(_HAIR_COLORS))]
+    hair_color = _color(random, "hair")
     collar, size = _collar(anatomy)
     eyes = tuple(_eye(anatomy, side) for side in SIDES)
-    scalp = _scalp_hair(anatomy, recipe, hair_color, float(collar[1]), seed)
+    scalp = None
+    if recipe.hair == "long":
+        scalp = grow_long_hair(anatomy, hair_color, float(collar[1]), seed)
+    elif recipe.hair == "short":
+        scalp = grow_short_hair(anatomy, hair_color, seed)
     hair: list[Hair] = [] if scalp is None else [scalp]
     if recipe.brows_and_lashes:
         hair.append(grow_brows(anatomy, 0.7 * hair_color, seed))
@@ -118,9 +111,9 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
         lighting=studio_lighting(seed),
         visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders),
         eyes=eyes,
-        iris_color=_IRIS_COLORS[random.integers(len(_IRIS_COLORS))],
+        iris_color=_color(random, "iris"),
         wet_eyes=recipe.detail.wet_eyes,
-        shirt_color=_SHIRT_COLORS[random.integers(len(_SHIRT_COLORS))],
+        shirt_color=_color(random, "shirt"),
         hair=tuple(hair),
         glasses=glasses,
         shirt=shirt,
@@ -128,6 +121,11 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
         materials=materials,
         model_faces=kept,
     )
+
+
+def _color(random: np.random.Generator, of: str) -> Float[np.ndarray, " 3"]:
+    colors = PEOPLE["colors"][of]
+    return np.array(colors[random.integers(len(colors))], np.float32)
 
 
 def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.ndarray, " 3"]) -> PosedSubject:
@@ -146,14 +144,6 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
         R_world_head=R,
         viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
     )
-
-
-def _scalp_hair(
-    anatomy: Anatomy, recipe: SyntheticRecipe, color: Float[np.ndarray, " 3"], collar: float, seed: int
-) -> Strands | DrapedStrands | None:
-    if recipe.hair == "long":
-        return grow_long_hair(anatomy, color, collar, seed)
-    return grow_short_hair(anatomy, color, seed) if recipe.hair == "short" else None
 
 
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:

@@ -55,10 +55,6 @@ class Clip:
     timesteps: int
     fps: float
 
-    def frames(self) -> list[tuple[str, str, int]]:
-        """Sequence, camera and timestep of each frame."""
-        return [(self.sequence, self.camera_id, self.first + index) for index in range(self.timesteps)]
-
 
 HeldOut = Mapping[tuple[str, str, int], tuple[Experiment, Frame]]
 """The held-out frames of one run, whatever the protocol, by sequence, camera and timestep."""
