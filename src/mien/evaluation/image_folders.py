@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mien.camera import Box
 from mien.disk.files import read_json, write_json
 from mien.disk.inside import listed
 from mien.errors import UserError
@@ -29,7 +30,6 @@ from mien.evaluation.scoring import (
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar, say
 from mien.media.decoding import decode_picture
-from mien.media.pictures import Box
 from mien.media.video import read_video_frames
 from mien.tracking.scoring import head_crop
 from mien.training.footage.frames import evenly_spread

@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.camera import Box
 from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
 from mien.face.parts import PARTS
 from mien.machine.threads import asked_threads
-from mien.media.pictures import Box, to_uint8
+from mien.media.pictures import to_uint8
 from mien.pages.pages import METRICS
 from mien.perceptual.distance import MIN_SIDE, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips

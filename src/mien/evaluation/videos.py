@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
+from mien.camera import Box
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
 from mien.evaluation.metrics import crop_to
@@ -15,7 +16,7 @@ from mien.evaluation.protocols import AVATAR, Evaluation
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
 from mien.media.picture_files import write_png
-from mien.media.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
+from mien.media.pictures import WHITE, error_heat, shrink, side_by_side, to_uint8
 from mien.media.video import write_video
 from mien.training.footage.frames import Frame
 

@@ -12,8 +12,6 @@ from torch import Tensor
 from mien.media.picture_files import encode_picture
 
 WHITE = 255
-Box = tuple[int, int, int, int]
-"""Left, top, width and height of a part of a picture, in pixels."""
 ERROR_LIMIT = 0.25
 """Error, for colours in 0..1, that gets the brightest colour of `error_heat`."""
 

@@ -17,8 +17,8 @@ from torch.nn.functional import conv2d
 from mien import _native
 from mien.arrays import is_native, native, recycled, unpacked
 from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.camera import Box
 from mien.gaussians import Rendering
-from mien.media.pictures import Box
 from mien.perceptual.features import TrainingFeatures, load_training_features
 from mien.training.footage.sequence import Target
 
