@@ -148,10 +148,10 @@ def _crash() -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    from mien.commands.parsing import parse
-
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
-    command = parse(importlib.import_module("mien.commands." + name.replace("-", "_")), name, arguments)
+    modules = ("parsing", name.replace("-", "_"))
+    parsing, module = (importlib.import_module(f"mien.commands.{each}") for each in modules)
+    command = parsing.parse(module, name, arguments)
     asked_threads()
     if hasattr(command, "check"):
         command.check()

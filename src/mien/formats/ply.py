@@ -14,8 +14,8 @@ from mien.disk.files import write_atomically
 from mien.disk.limits import rigid_fault
 from mien.disk.reading import open_ordinary
 from mien.errors import UserError
-from mien.formats.format import Content, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, SplatOptions
+from mien.formats.format import Content, SplatOptions, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS
 
 if TYPE_CHECKING:
     import mien.gaussians

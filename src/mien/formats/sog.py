@@ -16,8 +16,8 @@ from mien.disk.files import write_atomically
 from mien.disk.limits import checked_whole
 from mien.disk.reading import open_archive, open_member, open_ordinary, parse_json
 from mien.errors import UserError
-from mien.formats.format import Content, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, SplatOptions, finite_arrays, gaussians_of, unit_quats
+from mien.formats.format import Content, SplatOptions, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
 from mien.gaussians import Gaussians
 from mien.media.decoding import announced_size
 

@@ -12,8 +12,8 @@ from mien.camera import Camera
 from mien.datasets.flame_poses import AXES, face_of_flame, in_front
 from mien.datasets.layouts.layout import MatteKind
 from mien.face.model import FaceModel
+from mien.face.models.flame_params import flame_params_of
 from mien.face.params import FaceParams
-from mien.formats.shared.flame_params import flame_params_of
 from mien.rotation import matrix_from_axis_angle
 from mien.training.footage.foreground import foreground_colors
 from mien.training.footage.frames import held_out_of, training_frames
