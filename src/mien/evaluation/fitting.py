@@ -22,38 +22,12 @@ _RATES = FaceTuning(within_bounds=True)
 """Learning rates for every method alike: those with which training corrects the tracking by default."""
 
 
-class FittedFaces:
-    """The fitted face parameters of an experiment's held-out timesteps, each computed when it is first asked for.
-
-    A timestep starts from the face parameters of the headline. All of its held-out cameras are fitted together, since
-    they show the same face. Nothing in the experiment changes, and results do not depend on the order of questions.
-
-    Each timestep takes `steps` optimiser steps, at least 1.
-    """
-
-    def __init__(self, experiment: Experiment, steps: int):
-        self._experiment = experiment
-        self._steps = steps
-        self._known: dict[tuple[int, int], FaceParams] = {}
-        self._frames: dict[tuple[int, int], list[Frame]] = {}
-        for frame in experiment.held_out_frames:
-            self._frames.setdefault((frame.sequence, frame.timestep), []).append(frame)
-
-    def face(self, frame: Frame) -> FaceParams:
-        """The face parameters of one held-out frame's timestep."""
-        key = (frame.sequence, frame.timestep)
-        if key not in self._known:
-            self._known[key] = fit_face(self._experiment, self._frames[key], self._steps)
-        return self._known[key]
-
-
 def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FaceParams:
     """Expression, joints, head rotation and head translation of one timestep, after some steps of Adam.
 
-    The loss is the mean absolute difference of colours, summed over the frames. Expression coefficients stay within the
-    bounds of the face model, or where the tracking left them.
-
-    `frames` are those of one timestep, from different cameras.
+    `frames` are those of one timestep, from different cameras, and are fitted together. The start are the face
+    parameters of the headline. The loss is the mean absolute difference of colours, summed over the frames. Expression
+    coefficients stay within the bounds of the face model, or where the tracking left them.
     """
     avatar = experiment.avatar
     targets = [(frame, target_image(experiment, frame)) for frame in frames]

@@ -26,7 +26,7 @@ from mien.evaluation.experiment import (
     scored_on,
     target_images,
 )
-from mien.evaluation.fitting import LOSS, FittedFaces
+from mien.evaluation.fitting import LOSS, fit_face
 from mien.evaluation.metrics import Border
 from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
@@ -42,6 +42,7 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
+from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
@@ -143,7 +144,7 @@ def evaluate_frames(
     threads = worker_threads(settings.threads)
     means, training_psnr = look_at_trained(experiment, _MAX_TRAINING_FRAMES, threads, mean=settings.baselines)
     baselines = make_baselines(experiment, threads, means) if settings.baselines else None
-    fitted = FittedFaces(experiment, settings.fit_steps) if settings.fit_faces else None
+    fit_steps = settings.fit_steps if settings.fit_faces else 0
 
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
@@ -164,7 +165,9 @@ def evaluate_frames(
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = drawn_frames(experiment, [frame for frame in frames if frame not in done], subjects, baselines, fitted)
+        jobs = drawn_frames(
+            experiment, [frame for frame in frames if frame not in done], subjects, baselines, fit_steps
+        )
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
@@ -187,9 +190,13 @@ def drawn_frames(
     frames: list[Frame],
     subjects: set[str],
     baselines: Baselines | None,
-    fitted: FittedFaces | None,
+    fit_steps: int,
 ) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
-    """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar."""
+    """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar.
+
+    With `fit_steps`, the face of each timestep is also fitted to all of its held-out pictures, in so many steps.
+    """
+    fitted: dict[tuple[int, int], FaceParams] = {}
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
     for frame in frames:
         start = time.perf_counter()
@@ -198,12 +205,16 @@ def drawn_frames(
         seconds = time.perf_counter() - start
         if as_tracked is not None:
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
-        if fitted is not None:
-            drawn[FITTED] = avatar_image(experiment, frame, fitted.face(frame))
+        if fit_steps:
+            key = frame.sequence, frame.timestep
+            if key not in fitted:
+                together = [each for each in experiment.held_out_frames if (each.sequence, each.timestep) == key]
+                fitted[key] = fit_face(experiment, together, fit_steps)
+            drawn[FITTED] = avatar_image(experiment, frame, fitted[key])
         if OVER_DARK in subjects:
             drawn[OVER_DARK] = drawn_image(experiment, frame, posed, DARK)
         if OPENED in subjects:
-            drawn[OPENED] = opened(drawn[AVATAR] if fitted is None else drawn[FITTED])
+            drawn[OPENED] = opened(drawn[FITTED if fit_steps else AVATAR])
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
             drawn[MESH] = baselines.mesh_image(experiment, frame)

@@ -103,13 +103,8 @@ def write_scored_pictures(folder: Path, experiment: Experiment) -> None:
     crops: dict[str, Box] = {}
     frames = experiment.held_out_frames
     for frame in track_progress(frames, f"pictures {folder.name}", len(frames)):
-        name = picture_name(experiment, frame)
+        name = f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"
         crops[name] = experiment.crop(frame)
         write_png(folder / "truth" / f"{name}.png", to_uint8(target_image(experiment, frame)))
         write_png(folder / "rendering" / f"{name}.png", to_uint8(avatar_image(experiment, frame)))
     write_crops(folder / "truth" / CROPS_NAME, crops)
-
-
-def picture_name(experiment: Experiment, frame: Frame) -> str:
-    """File name of a frame, without its ending."""
-    return f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"

@@ -45,18 +45,9 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.filters["with_code"] = with_code
-    environment.globals |= {"heat_gradient": _heat_gradient, "error_limit": _error_limit}
+    # The colours of `mien.media.pictures.heat_colors` from 0 to its limit, without OpenCV.
+    environment.globals["heat_gradient"] = (
+        "linear-gradient(90deg,rgb(0, 0, 4), rgb(66, 10, 104), rgb(147, 38, 103), rgb(221, 81, 58), rgb(252, 165, 10), "
+        "rgb(252, 255, 164))"
+    )
     return environment
-
-
-def _heat_gradient() -> str:
-    # Pictures need torch, and pages without them do not.
-    from mien.media.pictures import heat_gradient
-
-    return heat_gradient()
-
-
-def _error_limit() -> str:
-    from mien.media.pictures import ERROR_LIMIT
-
-    return f"{ERROR_LIMIT * 255:.0f}"
