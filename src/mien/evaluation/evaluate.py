@@ -39,21 +39,16 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     driver_dirs: Items[Path] = (),
 ) -> dict[str, Any]:
-    """Score a run on its held-out frames, and write metrics.json and report.html into its folder.
+    """Score a run on its held-out frames, write metrics.json and report.html into its folder, and return the former.
 
-    Args:
-        run_dir: A finished run.
-        sequence_dirs: The folders of the sequences it was trained on, in that order.
-        settings: What to compute; None for the defaults.
-        driver_dirs: Folders of tracked sequences that drive the avatar as well.
-
-    Returns:
-        The content of metrics.json: `protocols` and `training`.
+    `sequence_dirs` are the folders of the sequences it was trained on, in that order. Those of `driver_dirs`, also
+    tracked sequences, drive the avatar as well.
     """
+    settings = settings or EvaluationSettings()
     check_tree(run_dir)
-    check_ranges(settings or EvaluationSettings(), lambda name: f"--{name.replace('_', '-')}")
+    check_ranges(settings, lambda name: f"--{name.replace('_', '-')}")
     with hold(run_dir):
-        return _evaluate(run_dir, sequence_dirs, settings or EvaluationSettings(), driver_dirs)
+        return _evaluate(run_dir, sequence_dirs, settings, driver_dirs)
 
 
 def _evaluate(

@@ -86,7 +86,7 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
     """A picture of 8 bits per channel as RGB or RGBA. Grey becomes RGB."""
     try:
         # libpng would return the upper half of a truncated file.
-        cut = path.suffix.lower() == ".png" and _end_of(path) != b"IEND\xaeB`\x82"
+        cut = path.suffix.lower() == ".png" and path.read_bytes()[-8:] != b"IEND\xaeB`\x82"
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     picture = None if cut else decode_picture(path, cv2.IMREAD_UNCHANGED)
@@ -98,12 +98,6 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
         return np.repeat(picture[..., None], 3, axis=2)
     order = [2, 1, 0, 3][: picture.shape[2]]
     return np.ascontiguousarray(picture[..., order])
-
-
-def _end_of(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 8))
-        return file.read(8)
 
 
 @dataclass(frozen=True)
@@ -130,9 +124,8 @@ _Pair = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"], Box | None
 def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) -> dict[str, Any]:
     """Score pictures against their truth, matched by name, or for a video by order.
 
-    Returns:
-        The content that `write_scores` writes: mean `psnr, ssim, l1, perceptual`, the same on the `head` crop (None if
-        no crop is known), how they were computed, and `per_frame` figures.
+    The result has the means `psnr, ssim, l1, perceptual`, the same on the `head` crop (None if no crop is known), how
+    they were computed, and `per_frame` figures.
     """
     settings = settings or ScoreSettings()
     pairs = _Pairs(folders)
@@ -221,7 +214,8 @@ class _Pairs:
             self._check_size(name, image, truth, self._folders.images)
             crop = None if self._crops is None else self._crops[name]
             if mattes is not None:
-                matte = _opacity(next(mattes))
+                picture = next(mattes)
+                matte = np.ascontiguousarray(picture[..., 3 if picture.shape[2] == 4 else 1])  # opacity, or brightness
                 self._check_size(name, matte, truth, self._folders.mattes)
                 truth = composite(truth, matte, color)
                 crop = crop or _box(matte)
@@ -280,11 +274,6 @@ def _flat(picture: UInt8[np.ndarray, "h w _"], color: UInt8[np.ndarray, " 3"]) -
     if picture.shape[2] == 4:
         return composite(picture[..., :3], picture[..., 3], color)
     return picture
-
-
-def _opacity(picture: UInt8[np.ndarray, "h w _"]) -> UInt8[np.ndarray, "h w"]:
-    """A matte from its picture: the alpha channel if there is one, or else the brightness."""
-    return np.ascontiguousarray(picture[..., 3] if picture.shape[2] == 4 else picture[..., 1])
 
 
 def _box(matte: UInt8[np.ndarray, "h w"]) -> Box:

@@ -138,7 +138,11 @@ def evaluate_frames(
     subjects |= {OPENED} if settings.opened else set()
     subjects |= {OVER_DARK} if settings.over_dark(experiment) else set()
     kept = partial.read() if partial is not None else {}
-    done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
+    done = {  # with all subjects, and every figure that each frame must have
+        frame: scored
+        for frame, scored in kept.items()
+        if scored[0].keys() - {UNCLOTHED} == subjects and all(row.keys() >= _ALWAYS for row in scored[0].values())
+    }
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
     perceptual_frames = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
@@ -178,11 +182,6 @@ def evaluate_frames(
     scores = {subject: tuple(row[subject] for row in rows if subject in row) for subject in _figure_names(rows)}
     seconds = sorted(done[frame][1] for frame in frames)
     return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, training_psnr)
-
-
-def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
-    """Whether all subjects are scored, with every figure that each frame must have."""
-    return scores.keys() - {UNCLOTHED} == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
 
 
 def drawn_frames(
