@@ -15,18 +15,18 @@ from mien.cli import main
 from mien.disk.files import read_json
 from mien.evaluation import evaluate
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
-from mien.evaluation.fitting import fit_face
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
 from mien.evaluation.metrics import l1, psnr
-from mien.evaluation.partial import PartialScores
 from mien.evaluation.protocols import (
     AS_TRACKED,
     AVATAR,
     FITTED,
     OPENED,
     EvaluationSettings,
+    PartialScores,
     drawn_frames,
     evaluate_frames,
+    fit_face,
     opened,
     protocol_content,
 )

@@ -19,8 +19,7 @@ from mien.evaluation.living import FILM, living, write_film
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
 from mien.evaluation.page_parts import Video, video_of
-from mien.evaluation.partial import PartialScores
-from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
+from mien.evaluation.protocols import Evaluation, EvaluationSettings, PartialScores, evaluate_frames, protocol_content
 from mien.evaluation.report_sections import cross_section
 from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads

@@ -1,8 +1,11 @@
 """Protocols with true pictures: the avatar and both baselines on the same held-out frames, by the same metrics."""
 
+import contextlib
+import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal
 
@@ -12,7 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.avatar.avatar import frozen
+from mien.avatar.settings import FaceTuning, Progress
 from mien.disk.config import Range
+from mien.disk.files import write_atomically
+from mien.disk.inside import open_to_append
+from mien.disk.reading import parse_json, read_bytes
 from mien.evaluation.baselines import Baselines, look_at_trained, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import (
@@ -24,11 +32,10 @@ from mien.evaluation.experiment import (
     drawn_image,
     posed_avatar,
     scored_on,
+    target_image,
     target_images,
 )
-from mien.evaluation.fitting import LOSS, fit_face
 from mien.evaluation.metrics import Border
-from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
     PART_SIDE,
     PIXELS,
@@ -46,7 +53,11 @@ from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
+from mien.render import rasterize
+from mien.training.adam import Adam
+from mien.training.footage.face_track import FaceTrack
 from mien.training.footage.frames import Frame, spread_frames
+from mien.training.losses import photometric_loss
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
 OPENED, UNCLOTHED, OVER_DARK = "opened", "without_clothes", "over_dark"
@@ -60,6 +71,9 @@ _MASKS = {
 _MATTES = "the dataset's mattes, whole, over white"
 _CROP = "frozen head box of each frame"
 _PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
+_FIT_LOSS = "mean absolute difference of colours over the whole picture"
+_FIT_RATES = FaceTuning(within_bounds=True)
+"""Learning rates for every method alike: those with which training corrects the tracking by default."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +135,48 @@ class Evaluation:
         """Indices into `frames`, from the worst PSNR of the avatar on the head crop to the best."""
         figures = [entry["head_psnr"] for entry in self.scores[AVATAR]]
         return sorted(range(len(figures)), key=figures.__getitem__)
+
+
+Scored = tuple[dict[str, Scores], float]
+"""A frame's figures by the scored subject, and the seconds that rendering the avatar took."""
+
+
+@dataclass(frozen=True)
+class PartialScores:
+    """A file with one line per scored frame, after a first line with the fingerprint of the evaluation."""
+
+    path: Path
+    fingerprint: str
+    """Identity of the evaluation. Figures of any other evaluation are dropped."""
+
+    def read(self) -> dict[Frame, Scored]:
+        """The frames that were scored before. Empty if the file is of another run or other settings, or is damaged.
+
+        Cuts the file back to its good lines, because a killed process may leave half a line. Creates the file if
+        needed.
+        """
+        good: list[str] = [json.dumps({"scores_of": self.fingerprint})]
+        found: dict[Frame, Scored] = {}
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
+            first, *lines = read_bytes(self.path, 256 << 20).decode("utf-8", "replace").split("\n")
+            for line in lines if first == good[0] else ():
+                content = parse_json(line)
+                rows = {name: {key: float(row[key]) for key in row} for name, row in content["scores"].items()}
+                found[Frame(*content["frame"])] = (rows, float(content["seconds"]))
+                good.append(line)
+        text = "\n".join(good) + "\n"
+        write_atomically(self.path, lambda aside: aside.write_text(text, encoding="utf-8"))
+        return found
+
+    def add(self, frame: Frame, scores: Mapping[str, Scores], seconds: float) -> None:
+        """Append one more frame."""
+        line = json.dumps({"frame": list(frame), "scores": dict(scores), "seconds": seconds})
+        with open_to_append(self.path) as file:
+            file.write(line + "\n")
+
+    def remove(self) -> None:
+        """Delete the file, because the figures are in metrics.json now."""
+        self.path.unlink(missing_ok=True)
 
 
 def evaluate_frames(
@@ -220,6 +276,36 @@ def drawn_frames(
         yield frame, drawn, seconds
 
 
+def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FaceParams:
+    """Expression, joints, head rotation and head translation of one timestep, after some steps of Adam.
+
+    MonoGaussianAvatar (Chen et al. 2024, supplement B.4) is scored in this way. The figure shows what the avatar can
+    draw if its tracking is right. It uses the pixels that are scored, so it is no figure of a prediction.
+
+    `frames` are those of one timestep, from different cameras, and are fitted together. The start are the face
+    parameters of the headline. The loss is the mean absolute difference of colours, summed over the frames. Expression
+    coefficients stay within the bounds of the face model, or where the tracking left them.
+    """
+    avatar = experiment.avatar
+    targets = [(frame, target_image(experiment, frame)) for frame in frames]
+    track = FaceTrack(experiment.face(frames[0]), _FIT_RATES, bounds=avatar.face_model.expression_bounds)
+    adam = Adam()
+    with torch.enable_grad(), frozen(avatar):
+        for step in range(steps):
+            gaussians = avatar.pose(track.face(0)).gaussians.timestep(0)
+            white = torch.ones(3).to(gaussians.means)
+            drawn = [(frame, rasterize(gaussians, experiment.camera(frame), white)) for frame, _ in targets]
+            images = [experiment.lit(picture, white, frame).image for frame, picture in drawn]
+            losses = [
+                photometric_loss(image, target, l1_weight=1.0, ssim_weight=0.0)
+                for image, (_, target) in zip(images, targets, strict=True)
+            ]
+            torch.autograd.backward(losses)
+            adam.step(track.parameter_groups(0), Progress(step, steps))
+            track.confine(0)
+    return track.face(0).detach()
+
+
 def opened(picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """The picture eroded and then dilated by 3x3 pixels, each channel by itself, as MonoGaussianAvatar scores it."""
     return torch.from_numpy(cv2.morphologyEx(picture.numpy(), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
@@ -251,7 +337,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
     if OVER_DARK in further:
         further[OVER_DARK]["color"] = list(DARK)
     if FITTED in further:
-        further[FITTED]["fit"] = {"steps": settings.fit_steps, "loss": LOSS}
+        further[FITTED]["fit"] = {"steps": settings.fit_steps, "loss": _FIT_LOSS}
     for name in (OPENED, UNCLOTHED):
         if name in scores:
             further[name] = {**mean_scores(scores[name]), "frames": len(scores[name])}
