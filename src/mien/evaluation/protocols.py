@@ -161,7 +161,9 @@ class PartialScores:
             first, *lines = read_bytes(self.path, 256 << 20).decode("utf-8", "replace").split("\n")
             for line in lines if first == good[0] else ():
                 content = parse_json(line)
-                rows = {name: {key: float(row[key]) for key in row} for name, row in content["scores"].items()}
+                rows: dict[str, Scores] = {
+                    name: {key: float(row[key]) for key in row} for name, row in content["scores"].items()
+                }
                 found[Frame(*content["frame"])] = (rows, float(content["seconds"]))
                 good.append(line)
         text = "\n".join(good) + "\n"
