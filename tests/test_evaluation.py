@@ -19,7 +19,7 @@ from mien.evaluation.report_sections import spans
 from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
 from mien.gaussians import sh_from_rgb
-from mien.pages.plots import Axes, Series, line_chart
+from mien.pages.pages import Axes, Series, line_chart
 from mien.perceptual.distance import load_perceptual
 from mien.tracking.tracking import PARTS
 from mien.training.footage.frames import Frame

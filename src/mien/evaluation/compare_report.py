@@ -30,8 +30,7 @@ from mien.evaluation.report_sections import frame_name
 from mien.machine.progress import track_progress
 from mien.media.pictures import data_uri, error_heat, picture_uri, to_uint8
 from mien.media.video import read_video_frames
-from mien.pages.pages import render
-from mien.pages.plots import Axes, Series, line_chart
+from mien.pages.pages import Axes, Series, line_chart, render
 from mien.training.footage.frames import Frame
 
 _FRAMES = 5

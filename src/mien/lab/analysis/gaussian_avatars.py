@@ -25,7 +25,7 @@ from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.machine.terminal import counted
 from mien.media.pictures import side_by_side, to_uint8
-from mien.pages.plots import Axes, Series
+from mien.pages.pages import Axes, Series
 from mien.render import rasterize
 from mien.training.footage.frames import Frame, spread_frames
 

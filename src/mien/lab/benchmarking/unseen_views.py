@@ -20,7 +20,7 @@ from mien.lab.synthetic.recipe import SIDES
 from mien.lab.synthetic.truth import Truth
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
-from mien.pages.plots import Axes, Series, write_chart
+from mien.pages.pages import Axes, Series, write_chart
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
 from mien.tracking.neck_cut import NeckParts
