@@ -6,7 +6,7 @@ from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.settings import Rate
 from mien.face import FaceModel
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from plain_settings import plain_mono_gaussian_avatar
 from toy_scene import toy_face, toy_face_model
 

@@ -26,7 +26,7 @@ from mien.lab.analysis import gaussian_avatars, measuring
 from mien.lab.analysis.gaussian_avatars import binned, jaw_opening, open_jaw, without_teeth
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.result import Chart, Result, Table
-from mien.pages.plots import Axes, Series
+from mien.pages.pages import Axes, Series
 from mien.training.run import read_curves
 from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 from web_case import violations

@@ -14,10 +14,10 @@ from mien.capture.quality import FrameQuality
 from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
-from mien.evaluation.fitting import fit_face
 from mien.evaluation.metrics import l1
+from mien.evaluation.protocols import fit_face
 from mien.face import FaceModel
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from mien.training import TrainSettings, train
 from mien.training.adam import Adam
 from mien.training.alignment import align_faces

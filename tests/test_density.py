@@ -14,8 +14,7 @@ from mien.avatar.avatar import Posed
 from mien.avatar.density import GradientDensity, RefillDensity, split_along_axes
 from mien.avatar.settings import GradientSettings, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
-from mien.gaussians import Gaussians
-from mien.render.rendering import Rendering
+from mien.gaussians import Gaussians, Rendering
 from mien.rotation import matrix_from_quaternion
 from mien.training.density_control import density_strategy
 from mien.training.density_control.gradient import GradientStrategy

@@ -23,9 +23,8 @@ from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
 from mien.face import FaceModel
-from mien.gaussians import Gaussians
+from mien.gaussians import Gaussians, Rendering
 from mien.machine.devices import choose_device, like_on
-from mien.render.rendering import Rendering
 from mien.training import TrainSettings, batch, train, trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames

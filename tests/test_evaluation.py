@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +16,10 @@ from mien.evaluation.experiment import Experiment, avatar_image, head_box, targe
 from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report_sections import spans
-from mien.evaluation.run_report import RunRecord, report_html
+from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import PART_SIDE, as_8_bit, enlarged, mean_scores, score_pictures
 from mien.gaussians import sh_from_rgb
-from mien.pages.plots import Axes, Series, line_chart
+from mien.pages.pages import Axes, Series, line_chart
 from mien.perceptual.distance import load_perceptual
 from mien.tracking.tracking import PARTS
 from mien.training.footage.frames import Frame
@@ -168,9 +169,13 @@ def _run_record() -> RunRecord:
     )  # fmt: skip
 
 
-def test_report_stands_alone_shows_everything_and_survives_gaps(experiment: Experiment, evaluation: Evaluation) -> None:
+def test_report_stands_alone_shows_everything_and_survives_gaps(
+    experiment: Experiment, evaluation: Evaluation, tmp_path: Path
+) -> None:
     protocols = {"self_reenactment": protocol_content(experiment, evaluation, EvaluationSettings())}
-    page = report_html(_run_record(), protocols, {"self_reenactment": (experiment, evaluation)})
+    results = {"self_reenactment": (experiment, evaluation)}
+    write_report(tmp_path / "report.html", _run_record(), protocols, results, {}, None, None)
+    page = (tmp_path / "report.html").read_text()
     assert not re.search(r"https?://|<script|<link|url\(|/somewhere", page)
     assert "mien create &#39;&lt;clip&gt;.mp4&#39;" in page, "the command must be there, quoted and escaped"
     for wanted in ("Held-out frames", "worst", "Mean training picture", "Gaussians", "1 min 11 s", ">Eyes<"):

@@ -70,8 +70,9 @@ class _MadeUpReader(contextlib.nullcontext):
     def __enter__(self) -> "_MadeUpReader":
         return self
 
-    def read(self, image: np.ndarray) -> np.ndarray | None:
-        return None if image.min() == 255 else _face() @ _turn(0.0, float(image.mean()) / 255, 0.0).T
+    def read(self, image: np.ndarray) -> np.ndarray:
+        face = _face() @ _turn(0.0, float(image.mean()) / 255, 0.0).T
+        return face[None][: int(image.min() < 255)]
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_protocol_from_folders(folders: tuple[Path, Path], monkeypatch, capsys) -> None:
-    monkeypatch.setattr(cross, "FaceReader", _MadeUpReader)
+    monkeypatch.setattr(cross, "MeshReader", lambda *_, **__: _MadeUpReader())
     own, driver = folders
     anna, bert = own.parent.parent, driver.parent.parent
     assert main(["evaluate", str(anna), "--no-perceptual", "--drivers", str(bert), str(own)]) == 0
@@ -113,7 +114,7 @@ def test_protocol_from_folders(folders: tuple[Path, Path], monkeypatch, capsys) 
 
 
 def test_drivers_that_cannot_drive(folders: tuple[Path, Path], tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(cross, "FaceReader", _MadeUpReader)
+    monkeypatch.setattr(cross, "MeshReader", lambda *_, **__: _MadeUpReader())
     monkeypatch.setattr(cross.Driven, "driver_picture", lambda self, timestep: np.full((8, 8, 3), 255, np.uint8))
     own, driver = folders
     run = own.parent.parent / "runs" / "first"

@@ -13,13 +13,23 @@ from evaluation_case import drawn_sequence, make_experiment, write_run, write_se
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.disk.files import read_json
-from mien.evaluation import evaluate, protocols
+from mien.evaluation import evaluate
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
-from mien.evaluation.fitting import FittedFaces, fit_face
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
 from mien.evaluation.metrics import l1, psnr
-from mien.evaluation.partial import PartialScores
-from mien.evaluation.protocols import AS_TRACKED, AVATAR, FITTED, EvaluationSettings, evaluate_frames, protocol_content
+from mien.evaluation.protocols import (
+    AS_TRACKED,
+    AVATAR,
+    FITTED,
+    OPENED,
+    EvaluationSettings,
+    PartialScores,
+    drawn_frames,
+    evaluate_frames,
+    fit_face,
+    opened,
+    protocol_content,
+)
 from mien.evaluation.scoring import ScoreSettings
 from mien.evaluation.text import protocol_lines
 from mien.media.video import write_video
@@ -202,13 +212,14 @@ def test_fitted_faces_draw_the_picture_better_and_change_nothing_else(method: st
 def test_fits_are_a_third_figure_in_any_order_and_never_the_headline(tmp_path: Path) -> None:
     experiment = astray(make_experiment(10))
     frames = experiment.held_out_frames
-    there, back = FittedFaces(experiment, 3), FittedFaces(experiment, 3)
-    forward, backward = ({each: fits.face(each) for each in frames[::way]} for fits, way in ((there, 1), (back, -1)))
-    assert all(forward[each].expression.equal(backward[each].expression) for each in frames)
-    assert there.face(frames[0]) is forward[frames[0]]
-    for fits, shown in ((there, FITTED), (None, AVATAR)):
-        ((_, drawn, _),) = protocols.drawn_frames(experiment, [frames[0]], {protocols.OPENED}, None, fits)
-        assert drawn[protocols.OPENED].equal(protocols.opened(drawn[shown])), "the picture of the fitted face, if any"
+    for steps, shown in ((3, FITTED), (0, AVATAR)):
+        forward, backward = (
+            {frame: drawn for frame, drawn, _ in drawn_frames(experiment, list(order), {OPENED}, None, steps)}
+            for order in (frames, frames[::-1])
+        )
+        for frame in frames:
+            assert forward[frame][shown].equal(backward[frame][shown])
+            assert forward[frame][OPENED].equal(opened(forward[frame][shown])), "the fitted face, if there is one"
     experiment = astray(make_experiment(10))
     plain = evaluate_frames(experiment, QUICK)
     partial = PartialScores(tmp_path / "partial", "one")

@@ -32,7 +32,7 @@ from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.evaluation.image_folders import ImageFolders, score_folders
 from mien.face import FaceModel
-from mien.formats.shared.flame_params import face_of_flame_params
+from mien.face.models.flame_params import face_of_flame_params
 from mien.pipeline import train as training
 from mien.pipeline.export_dataset import settings_of
 from mien.tracking import write_tracking

@@ -16,9 +16,9 @@ from mien.avatar import Avatar
 from mien.avatar.methods import METHODS
 from mien.face import FaceModel, FaceParams
 from mien.face.models.flame import flame_face_model, read_flame
+from mien.face.models.flame_params import read_flame_params, write_flame_params
 from mien.formats import read_ply
 from mien.formats.gaussian_avatars import read_gaussian_avatars_folder, write_gaussian_avatars_folder
-from mien.formats.shared.flame_params import read_flame_params, write_flame_params
 from mien.render import rasterize
 from plain_settings import plain_gaussian_avatars
 from refusals import refuses
@@ -123,7 +123,7 @@ def test_parameters_are_those_of_flame(flame: FaceModel, tmp_path: Path) -> None
 
 def test_offsets_without_teeth_are_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flame: FaceModel) -> None:
     v = len(flame.template)
-    monkeypatch.setattr("mien.formats.shared.flame_params.TEETH", (v - 20, v))
+    monkeypatch.setattr("mien.face.models.flame_params.TEETH", (v - 20, v))
     write_flame_params(tmp_path / "flame_param.npz", flame, flame_face(flame))
     own = known(flame_face(flame).vertex_offsets)
     change(tmp_path, static_offset=own[None, : v - 20].numpy(), dynamic_offset=np.zeros((4, v, 3), np.float32))

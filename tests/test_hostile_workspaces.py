@@ -23,8 +23,7 @@ from mien.disk.inside import check_tree, inside, is_plain_name, remove_tree
 from mien.disk.workspace import Workspace, check_new_workspace, open_workspace
 from mien.evaluation import evaluate
 from mien.evaluation.experiment import Frame
-from mien.evaluation.partial import PartialScores
-from mien.evaluation.protocols import EvaluationSettings
+from mien.evaluation.protocols import EvaluationSettings, PartialScores
 from mien.face.loading import read_landmarks
 from mien.tracking import read_tracking, track_subject
 from mien.tracking.pipeline import track as pipeline

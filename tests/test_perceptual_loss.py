@@ -13,12 +13,12 @@ from torch.nn.functional import conv2d, interpolate, max_pool2d
 import train_toy
 from mien import _native
 from mien.avatar.settings import PerceptualLoss, Photometric
+from mien.camera import Box
 from mien.errors import UserError
 from mien.face import FaceModel
-from mien.media.pictures import Box
+from mien.gaussians import Rendering
 from mien.perceptual.features import load_training_features
 from mien.perceptual.weights import weights_path
-from mien.render.rendering import Rendering
 from mien.training import train
 from mien.training.footage.frames import CROP, random_at
 from mien.training.footage.sequence import Sequence, Target, Targets

@@ -150,7 +150,7 @@ def test_help_names_what_packages_add(fork_server: ForkServer, toys: Path) -> No
 FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], object], str]] = {
     "model": (lambda a: a.update(expression=np.zeros((5, 9), np.float32)), "'expression' has the shape [5, 9]"),
     "pickle": (lambda a: a.update(K=np.array([{}], object)), "'K': holds object, not plain numbers"),
-    "nan": (lambda a: a.update(expression=np.full((5, 2), np.nan, np.float32)), "expression holds NaN"),
+    "nan": (lambda a: a.update(expression=np.full((5, 2), np.nan, np.float32)), "'expression' holds numbers that"),
     "behind": (lambda a: a.update(viewmat=np.eye(4)), "in frame 0 the head is behind every camera"),
 }
 

@@ -20,7 +20,7 @@ import pytest
 from forked import Forked, ForkServer
 from fuzzing.kills import SIGNALS, differing_files, hidden_files
 from mien.cli import main
-from mien.evaluation.partial import PartialScores
+from mien.evaluation.protocols import PartialScores
 from mien.machine import stops
 from mien.machine.stops import EXIT_HUNG_UP, EXIT_TERMINATED, HungUp, Terminated, orderly_stops, stops_put_off
 from mien.media.video import read_video_frames

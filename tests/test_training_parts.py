@@ -15,7 +15,7 @@ from mien import _native
 from mien.avatar.avatar import ParameterGroup, store_group
 from mien.avatar.settings import Photometric, Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from mien.training import train
 from mien.training.adam import Adam
 from mien.training.batch import AHEAD, targets_ahead

@@ -39,11 +39,8 @@ def is_native(*tensors: Tensor) -> bool:
 def native(reference: Callable[..., Any]) -> Callable[[_Operation], _Operation]:
     """Decorate an operation that calls the native core, so that `reference` computes what the core cannot take.
 
-    Every native operation is dispatched in this way. Both functions take the same arguments. The tensors among them
-    decide, but not those inside of records.
-
-    Args:
-        reference: The operation in plain PyTorch, for any dtype and device.
+    Every native operation is dispatched in this way. `reference` is the same in plain PyTorch, for any dtype and
+    device, and takes the same arguments. The tensors among them decide, but not those inside of records.
     """
 
     def decorate(operation: _Operation) -> _Operation:

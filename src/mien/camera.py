@@ -9,7 +9,10 @@ from torch import Tensor
 
 from mien.rotation import compose_rigid, invert_rigid, rigid_transform
 
-__all__ = ["Camera", "camera_from_fov", "look_at"]
+__all__ = ["Box", "Camera", "camera_from_fov", "look_at"]
+
+Box = tuple[int, int, int, int]
+"""Left, top, width and height of a part of a picture, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)

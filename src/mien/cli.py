@@ -72,7 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if the terminal was closed, and 141 if nobody reads the output any more.
     """
     open_closed_streams()
-    _print_what_can_be_printed()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # help and file names have characters that its encoding may lack
     try:
         try:
             return _main(list(sys.argv[1:] if arguments is None else arguments))
@@ -112,12 +113,6 @@ def _main(arguments: list[str]) -> int:
         return _crash()
 
 
-def _print_what_can_be_printed() -> None:
-    """Replace characters that standard output's encoding lacks with question marks. Help and file names have some."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
-
-
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         show(_overview())
@@ -148,28 +143,23 @@ def _crash() -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    from mien.commands.parsing import parse
-
     os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
-    command = parse(importlib.import_module("mien.commands." + name.replace("-", "_")), name, arguments)
+    modules = ("parsing", name.replace("-", "_"))
+    parsing, module = (importlib.import_module(f"mien.commands.{each}") for each in modules)
+    command = parsing.parse(module, name, arguments)
     asked_threads()
     if hasattr(command, "check"):
         command.check()
     with orderly_stops():
         use_one_torch_thread()
-        _check_instruction_set()
+        from mien import _native
+
+        try:
+            _native.rasterize_isa()
+        except ValueError as error:  # this machine lacks the instruction set that MIEN_ISA asks for
+            raise UserError(f"{error}; give one of these, or unset it") from None
         command.run()
     return 0
-
-
-def _check_instruction_set() -> None:
-    """Check that this machine has the instruction set that MIEN_ISA asks for."""
-    from mien import _native
-
-    try:
-        _native.rasterize_isa()
-    except ValueError as error:
-        raise UserError(f"{error}; give one of these, or unset it") from None
 
 
 def _overview() -> str:

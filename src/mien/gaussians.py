@@ -1,13 +1,13 @@
-"""Activated 3D Gaussians: the value object that renderers take."""
+"""Activated 3D Gaussians and pictures of them: the value objects that renderers take and return."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-__all__ = ["Gaussians", "sh_from_rgb", "stack_timesteps", "world_means"]
+__all__ = ["Gaussians", "Rendering", "sh_from_rgb", "stack_timesteps", "world_means"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +88,23 @@ class Gaussians:
         """Each tensor that is not None, with its number of axes when unbatched, in the order of the fields."""
         entries = [(self.means, 2), (self.quats, 2), (self.scales, 2), (self.opacities, 1), (self.sh, 3)]
         return entries if self.T_world_local is None else [*entries, (self.T_world_local, 2)]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """One picture, or a batch of them with a leading axis."""
+
+    image: Float[Tensor, "*b h w 3"]
+    """RGB over the background, not clamped from above."""
+    alpha: Float[Tensor, "*b h w"]
+    """Opacity of all Gaussians together, 0..1."""
+    radii: Int[Tensor, "*b n"]
+    """Extent on screen in pixels (3 sigma of the 2D Gaussian's longer axis, rounded up); 0 where not drawn."""
+    means2d_offset: Float[Tensor, "*b n 2"]
+    """Zeros added to the projected centres. After `backward()` its `.grad` is the gradient of the loss with respect to
+    the centres in pixels, which density control reads."""
+    depth: Float[Tensor, "*b h w"] | None = None
+    """Expected depth along the camera's z axis in metres, 0 in empty pixels; None unless requested. Differentiable."""
 
 
 def stack_timesteps(timesteps: Sequence[Gaussians]) -> Gaussians:

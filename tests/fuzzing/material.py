@@ -31,8 +31,7 @@ from mien.commands.batch_table import read_table
 from mien.disk.config import encode
 from mien.disk.files import write_json, write_tensors
 from mien.evaluation import evaluate
-from mien.evaluation.partial import PartialScores
-from mien.evaluation.protocols import EvaluationSettings
+from mien.evaluation.protocols import EvaluationSettings, PartialScores
 from mien.face.cache import cache_folder
 from mien.face.listing import ADDED_RECIPE
 from mien.face.loading import load_face_model, write_face_model, write_landmarks

@@ -20,7 +20,7 @@ from mien.driving.speech import motion_of_sound
 from mien.evaluation.image_folders import read_crops
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import read_metrics
-from mien.evaluation.partial import PartialScores
+from mien.evaluation.protocols import PartialScores
 from mien.face.models.flame import flame_face_model, read_flame
 from mien.formats import read_ply
 from mien.formats.gaussian_avatars import read_gaussian_avatars_folder

@@ -20,8 +20,7 @@ from mien.avatar.settings import TRAINED, MethodConfig, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.gaussians import Gaussians
-from mien.render.rendering import Rendering
+from mien.gaussians import Gaussians, Rendering
 from mien.runtime.baked import BakedAvatar, Filmed
 
 _CALM_SHARE = 0.1  # share of the timesteps that are used to estimate the expression at rest

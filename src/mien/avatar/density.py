@@ -13,8 +13,7 @@ from torch import Tensor
 
 from mien.avatar.settings import GradientSettings, RefillSettings
 from mien.avatar.store import GaussianStore
-from mien.gaussians import Gaussians
-from mien.render.rendering import Rendering
+from mien.gaussians import Gaussians, Rendering
 from mien.rotation import matrix_from_quaternion
 
 

@@ -159,18 +159,12 @@ def read_arrays(path: Path, axes: Mapping[str, str], sizes: Mapping[str, int]) -
     `axes` has a letter for each axis of each array, such as "tyx3". Axes of one letter are equally long, and a digit is
     a length. `sizes` are lengths that are known, by letter.
     """
+    from mien.face.models.schema import check_arrays
+
     with readable(path, ".npz", REMEDY):
         arrays = read_npz(path, tuple(axes))[1]
-    known = {**{str(digit): digit for digit in range(10)}, **sizes}
-    for name, letters in axes.items():
-        if name not in arrays:
-            raise UserError(f"{path}: has no {name!r}; {REMEDY}")
-        shape = arrays[name].shape
-        expected = [known.setdefault(letter, size) for letter, size in zip(letters, shape, strict=False)]
-        if len(letters) != len(shape) or list(shape) != expected or 0 in shape:
-            raise UserError(
-                f"{path}: {name!r} has the shape {list(shape)}, which is not [{', '.join(letters)}]; {REMEDY}"
-            )
+    shapes = {name: " ".join(letters) for name, letters in axes.items()}
+    check_arrays(path, arrays, shapes, "it cannot be read", REMEDY, sizes)
     return {name: each.astype(np.float32) if each.dtype.kind == "f" else each for name, each in arrays.items()}
 
 

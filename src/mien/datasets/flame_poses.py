@@ -11,8 +11,8 @@ from jaxtyping import Float
 from mien.camera import Camera
 from mien.errors import UserError
 from mien.face.model import FaceModel
+from mien.face.models.flame_params import face_of_flame_params
 from mien.face.params import FaceParams
-from mien.formats.shared.flame_params import face_of_flame_params
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
 AXES = np.diag([1.0, -1.0, -1.0])
@@ -39,7 +39,7 @@ def needed_flame(path: Path, face_model: FaceModel | None, version: str) -> Face
 def face_of_flame(path: Path, face_model: FaceModel, arrays: Mapping[str, np.ndarray]) -> FaceParams:
     """Return face parameters from some of the arrays of flame_param.npz. Missing poses are at rest.
 
-    They are `shape` [n] and `expr` [t, e], and perhaps others (`mien.formats.face_of_flame_params`).
+    They are `shape` [n] and `expr` [t, e], and perhaps others (`mien.face.models.flame_params.face_of_flame_params`).
     """
     t = len(arrays["expr"])
     rest = {name: np.zeros((t, 3)) for name in ("rotation", "translation", "neck_pose", "jaw_pose")}

@@ -60,8 +60,8 @@ def _recognises(path: Path) -> str | None:
 
 
 def _clips(path: Path) -> list[_Clip]:
-    clips = [_Clip(file, content, frames_of(file, content)) for file in _files(path)
-             for content in [read_object(file)]]  # fmt: skip
+    contents = {file: read_object(file) for file in _files(path)}
+    clips = [_Clip(file, content, frames_of(file, content)) for file, content in contents.items()]
     if not clips:
         raise UserError(f"{path}: has no {_FILE} with world_mat; {REMEDY}")
     names = [clip.name for clip in clips]
@@ -110,14 +110,6 @@ def camera_from_imavatar(intrinsics: np.ndarray, size: tuple[int, int]) -> np.nd
     return pinhole(abs(fx) * width, abs(fy) * height, cx * width + 0.5, cy * height + 0.5)
 
 
-def pose_from_imavatar(world_mats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations and translations [t, 3, 3], [t, 3] from FLAME's world to that of the camera `flame_poses.FRONT`.
-
-    The cameras' axes are those of that world, because OpenCV's axes are turned twice.
-    """
-    return world_mats[:, :3, :3], world_mats[:, :3, 3] / _SCALE
-
-
 def _pictures(clip: _Clip, root: Path) -> tuple[np.ndarray, np.ndarray]:
     from mien.datasets.pictures import read_matte, read_one_camera
 
@@ -157,7 +149,8 @@ def _face(clip: _Clip, model: "FaceModel") -> "FaceParams":
         "expr": stacked(file, frames, "expression", (50,)),
         "rotation": poses[:, :3], "neck_pose": poses[:, 3:6], "jaw_pose": poses[:, 6:9], "eyes_pose": poses[:, 9:],
     }  # fmt: skip
-    return carried(face_of_flame(file, model, arrays), *pose_from_imavatar(mats))
+    # The cameras' axes are those of the world of `flame_poses.FRONT`, because OpenCV's axes are turned twice.
+    return carried(face_of_flame(file, model, arrays), mats[:, :3, :3], mats[:, :3, 3] / _SCALE)
 
 
 def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:

@@ -26,12 +26,9 @@ def _video(path: Path) -> Path | None:
 def _table(path: Path) -> Path | None:
     """The csv of coefficients: the calibrated one, or the only one."""
     tables = [each for each in listed(path, "*.csv") if b"blendshapecount" in sniff(each)[:4096].lower()]
-    for ending in ("_cal.csv", ""):
-        chosen = [each for each in tables if each.name.lower().endswith(ending)]
-        chosen = chosen if ending else [each for each in chosen if not each.stem.lower().endswith(("_raw", "_neutral"))]
-        if chosen:
-            return chosen[0]
-    return tables[0] if tables else None
+    calibrated = [each for each in tables if each.stem.lower().endswith("_cal")]
+    others = [each for each in tables if not each.stem.lower().endswith(("_raw", "_neutral"))]
+    return next(iter([*calibrated, *others, *tables]), None)
 
 
 def _recognises(path: Path) -> str | None:

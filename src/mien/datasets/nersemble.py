@@ -32,20 +32,14 @@ SERIALS = (
 )  # fmt: skip
 """The cameras in the order of the indices 0 to 15 that papers use. Index 8 is the frontal camera."""
 FRONTAL = SERIALS[8]
+CALIBRATION, _COLORS = "calibration/camera_params.json", "calibration/color_calibration.json"
+"""Names of files in the folder of a person."""
 _STRIDE = 3
 _EMPTY = "BACKGROUND"
 
 
-def _calibration(path: Path) -> Path:
-    return path / "calibration" / "camera_params.json"
-
-
-def _color_calibration(path: Path) -> Path:
-    return path / "calibration" / "color_calibration.json"
-
-
 def _recognises(path: Path) -> str | None:
-    if not _calibration(path).is_file() or not (path / "sequences").is_dir():
+    if not (path / CALIBRATION).is_file() or not (path / "sequences").is_dir():
         return None
     names = _names(path)
     if not names or any(has_mattes(path / "sequences" / name) for name in names):
@@ -120,18 +114,18 @@ def _survey(path: Path) -> Findings:
         "two of three frames",
         "mattes and tracking: `mien capture` and `mien track` make them",
     ]
-    colors = _color_calibration(path)
+    colors = path / _COLORS
     if not colors.is_file():
-        missing.append(f"colour correction (calibration/{colors.name}): cameras differ in their colours without it")
+        missing.append(f"colour correction ({_COLORS}): cameras differ in their colours without it")
     if not any((path / "sequences" / _EMPTY).glob("image_*.jpg")):
         missing.append(f"pictures of the empty scene (sequences/{_EMPTY}): mattes are less exact without them")
-    found = f"by calibration/{colors.name}; --no-color-correction leaves it out" if colors.is_file() else None
+    found = f"by {_COLORS}; --no-color-correction leaves it out" if colors.is_file() else None
     return Findings(tuple(clips), None, None, tuple(missing), found)
 
 
 def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    cameras = read_cameras(_calibration(path), SIZE)
-    colors = _color_calibration(path)
+    cameras = read_cameras(path / CALIBRATION, SIZE)
+    colors = path / _COLORS
     for name in _names(path):
         videos = {}
         for video in sorted((path / "sequences" / name / "images").glob("cam_*.mp4")):
@@ -139,7 +133,7 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
             videos[video.stem.removeprefix("cam_")] = video
         unknown = [serial for serial in videos if serial not in cameras]
         if unknown:
-            raise UserError(f"{_calibration(path)}: has no camera {unknown[0]}, of which {name} has a video; {REMEDY}")
+            raise UserError(f"{path / CALIBRATION}: has no camera {unknown[0]}, of which {name} has a video; {REMEDY}")
         yield Footage(
             name,
             tuple(videos.values()),
@@ -154,7 +148,7 @@ def _corrections(path: Path, serials: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Return the corrections of these cameras."""
     from mien.media.color_correction import color_correction
 
-    file = _color_calibration(path)
+    file = path / _COLORS
     content, found = read_object(file), {}
     for serial in serials:
         if serial not in content:

@@ -13,7 +13,7 @@ import torch
 from mien.camera import Camera
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
 from mien.datasets.flame_poses import FRONT, carried, face_of_flame, in_front, needed_flame
-from mien.datasets.nersemble import read_cameras
+from mien.datasets.nersemble import CALIBRATION, read_cameras
 from mien.datasets.nersemble_benchmark import FPS_MONO, FPS_VIEWS, TRACKING, VERSION, flame_from_benchmark
 from mien.errors import UserError
 from mien.face.model import FaceModel
@@ -47,7 +47,7 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
 
     `size` is the width and height of the pictures that the avatar was trained on.
     """
-    file = path / "calibration" / "camera_params.json"
+    file = path / CALIBRATION
     check_file_inside(path, file)
     known = read_cameras(file, size)
     for serial in TEST_CAMERAS:
@@ -59,7 +59,9 @@ def monocular_tasks(path: Path, face_model: FaceModel, size: tuple[int, int]) ->
         if not is_file_inside(path, tracking):
             continue
         flame, turns, shifts, scale = flame_from_benchmark(tracking)
-        views = {serial: _shrunk(known[serial], scale) for serial in TEST_CAMERAS}
+        views = {serial: known[serial].viewmat.double().numpy().copy() for serial in TEST_CAMERAS}
+        for view in views.values():  # of a world in which the face model has its own size
+            view[:3, 3] /= scale
         ahead = views[TRAINING_CAMERA]
         face = in_front(carried(face_of_flame(tracking, model, flame), turns, shifts / scale), ahead)
         placed = {serial: view @ np.linalg.inv(ahead) @ FRONT for serial, view in views.items()}
@@ -72,7 +74,7 @@ def view_task(path: Path, sequence: str, face: FaceParams, trained: dict[str, Ca
 
     `face` is the person at all timesteps, in the world of the trained cameras.
     """
-    file = path / "calibration" / "camera_params.json"
+    file = path / CALIBRATION
     check_file_inside(path, file)
     first = next(iter(trained.values()))
     known = read_cameras(file, (first.width, first.height))
@@ -103,13 +105,6 @@ def shortcomings(person: str, tasks: list[Task], monocular: bool) -> list[str]:
 
 def _tracking(path: Path, name: str) -> Path:
     return path / "sequences" / name / "tracking" / TRACKING
-
-
-def _shrunk(camera: Camera, scale: float) -> np.ndarray:
-    """World-to-camera matrix for a world in which the face model has its own size."""
-    viewmat = camera.viewmat.double().numpy().copy()
-    viewmat[:3, 3] /= scale
-    return viewmat
 
 
 def _cameras(known: dict[str, Camera], placed: dict[str, np.ndarray]) -> dict[str, Camera]:

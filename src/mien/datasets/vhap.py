@@ -59,7 +59,8 @@ def _recognises(path: Path) -> str | None:
 def _groups(path: Path) -> list[_Group]:
     """The sequences of the folder, each with the frames of all its json files."""
     parts = [_WHOLE] if (path / _WHOLE).exists() else [name for name in _PARTS if (path / name).exists()]
-    trained = _keys(path / _TRAIN) if (path / _TRAIN).exists() else set()
+    training = frames_of(path / _TRAIN, read_object(path / _TRAIN)) if (path / _TRAIN).exists() else []
+    trained = {str(frame.get("file_path")) for frame in training}
     found: dict[str, dict[tuple[int, str], _Frame]] = {}
     for part in parts:
         file = path / part
@@ -67,14 +68,10 @@ def _groups(path: Path) -> list[_Group]:
             timestep, camera = _place(file, number, frame)
             name = _folder_of(path, file, frame)
             key = (timestep, camera)
-            own = _Frame(file, frame, (str(frame.get("file_path"))) in trained)
+            own = _Frame(file, frame, str(frame.get("file_path")) in trained)
             if found.setdefault(name, {}).setdefault(key, own).content is not frame:
                 raise UserError(f"{file}: holds camera {camera} of timestep {timestep} twice; {REMEDY}")
     return [_group(path, name, frames) for name, frames in found.items()]
-
-
-def _keys(file: Path) -> set[str]:
-    return {str(frame.get("file_path")) for frame in frames_of(file, read_object(file))}
 
 
 def _place(file: Path, number: int, frame: dict[str, Any]) -> tuple[int, str]:
@@ -158,12 +155,8 @@ def _flame_arrays(group: _Group, root: Path) -> dict[str, np.ndarray]:
         arrays = read_some_arrays(file, (*rows, *_SHARED))
         for name in _PARAMETERS:
             array = arrays.get(name)
-            if (
-                array is None
-                or array.ndim != 2
-                or len(array) != 1
-                or (rows[name] and array.shape != rows[name][0].shape)
-            ):
+            first = rows[name][0] if rows[name] else array
+            if array is None or first is None or array.ndim != 2 or len(array) != 1 or array.shape != first.shape:
                 raise UserError(f"{file}: {name!r} is not one row of numbers as in the other files; {REMEDY}")
             rows[name].append(array)
         if "dynamic_offset" in arrays and arrays["dynamic_offset"].any():
@@ -202,19 +195,14 @@ def _pictures(group: _Group, root: Path) -> tuple[np.ndarray, np.ndarray]:
     return images, mattes
 
 
-def _root(path: Path, groups: list[_Group]) -> Path:
-    """The folder that files must be in: the dataset's own, or that beside it for a UNION."""
-    own = path.resolve().name
-    return path if all(group.name == own for group in groups) else path.parent
-
-
 def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
     from mien.datasets.flame_poses import FRONT, camera_of, face_of_flame, in_front
     from mien.datasets.overlay import check_overlay
     from mien.datasets.sequences import filmed_sequence, tracked_sequence
 
     groups = _groups(path)
-    root = _root(path, groups)
+    # The files of a UNION are beside it.
+    root = path if all(group.name == path.resolve().name for group in groups) else path.parent
     for group in groups:
         face = None if model is None else face_of_flame(path, model, _flame_arrays(group, root))
         images, mattes = _pictures(group, root)
@@ -263,12 +251,11 @@ def _better(made: Any, cameras: Any, group: _Group) -> "TrackedSequence":
     if max(shifts) < 1:
         return above
     below = made(cameras=cameras(True))
-    fits = [measure_overlay(sequence) for sequence in (above, below)]
-    distances = [fit.distance for fit in fits]
-    if distances[0] is not None and distances[1] is not None:
-        is_below = distances[1] < distances[0]
+    one, other = (measure_overlay(sequence) for sequence in (above, below))
+    if one.distance is not None and other.distance is not None:
+        is_below = other.distance < one.distance
     else:
-        is_below = fits[1].agreement > fits[0].agreement
+        is_below = other.agreement > one.agreement
     say(f"{group.name}: cy is counted from {'below' if is_below else 'above'}, which fits the pictures better")
     return below if is_below else above
 

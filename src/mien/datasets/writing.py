@@ -61,13 +61,10 @@ def _write_into(folder: Path, sequence: TrackedSequence | FilmedSequence, datase
     write_own_split(folder, sequence.own_split, {"imported": imported})
     if sequence.foreign:
         write_arrays(folder / FOREIGN, dict(sequence.foreign))
-    if isinstance(sequence, TrackedSequence):
-        _write_tracking_into(folder, sequence, imported, capture_hash)
-
-
-def _write_tracking_into(folder: Path, sequence: TrackedSequence, imported: dict[str, str], capture_hash: str) -> None:
-    capture, tracking, face_model = sequence.capture, sequence.tracking, sequence.face_model
-    content = json.dumps([imported["dataset"], capture_hash, face_model.name, face_model.content_hash])
+    if not isinstance(sequence, TrackedSequence):
+        return
+    tracking, face_model = sequence.tracking, sequence.face_model
+    content = json.dumps([dataset.name, capture_hash, face_model.name, face_model.content_hash])
     fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
     settings = {**tracking.settings, "imported": imported, "fingerprint": fingerprint}
     write_tracking(folder / "tracking", replace(tracking, settings=settings))

@@ -59,13 +59,8 @@ class NotBelow:
     """A mark beside a field: its number must not be smaller than that of another field of the same settings."""
 
     other: str
-
-
-@dataclass(frozen=True)
-class Above:
-    """A mark beside a field: its number must be larger than that of another field of the same settings."""
-
-    other: str
+    above: bool = False
+    """Whether it must even be larger."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +99,10 @@ def check_ranges(settings: Any, option: Callable[[str], str]) -> None:
         if allowed is not None:
             check_range(value, allowed, option(field.name))
         for mark in marks_of(hint):
-            if isinstance(mark, NotBelow | Above):
-                least, above = getattr(settings, mark.other), isinstance(mark, Above)
-                if value < least or (above and value == least):
-                    asked = "more than" if above else "at least as much as"
+            if isinstance(mark, NotBelow):
+                least = getattr(settings, mark.other)
+                if value < least or (mark.above and value == least):
+                    asked = "more than" if mark.above else "at least as much as"
                     other = f"{option(mark.other)} {shown(least)}"
                     raise UserError(f"{option(field.name)} {shown(value)}: give {asked} {other}")
 
@@ -173,11 +168,8 @@ def decode(hint: Any, value: Any, where: str = "settings", remedy: str = "make i
 def overlay(base: Any, changes: Any, where: str, owner: str) -> Any:
     """Settings with some fields changed to values from json. All other fields stay, also in nested settings.
 
-    Args:
-        base: A dataclass.
-        changes: Field name -> value. As in the output of `encode`, a `kind` is allowed.
-        where: The place that messages name, followed by the field: "config.json: method".
-        owner: Whose settings these are, for a message about an unknown setting.
+    `changes` may have a `kind`, as in the output of `encode`. Messages name the place `where` ("config.json: method"),
+    and for an unknown setting the `owner` of the settings.
     """
     if not isinstance(changes, dict):
         raise UserError(f"{where} {_in_short(changes)}: give an object of settings, {{...}}")

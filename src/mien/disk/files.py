@@ -156,15 +156,14 @@ def read_json(
     `remedy` replaces that advice. A missing file still asks for its stage, if there is one. A larger file than `most`
     bytes is refused.
     """
+    anew = remedy or f"delete its folder and run {stage} again"
     try:
         content = parse_json(read_bytes(path, most).decode("utf-8"))
     except FileNotFoundError:
         asked = remedy if remedy and stage == _ANY_STAGE else f"run {stage} again"
         raise UserError(f"{path}: missing; {asked}") from None
     except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path}: cannot be read as json ({error}); {remedy or f'delete its folder and run {stage} again'}"
-        ) from None
+        raise UserError(f"{path}: cannot be read as json ({error}); {anew}") from None
     found = (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
     if found != (format_name, version):
         raise UserError(
@@ -172,9 +171,8 @@ def read_json(
             "; " + (remedy or f"run {stage} again")
         )
     if _CHECKSUM in content and content.pop(_CHECKSUM) != _json_checksum(content):
-        remedy = remedy or f"delete its folder and run {stage} again"
         raise UserError(
-            f"{path}: was damaged or edited after it was written; {remedy} "
+            f"{path}: was damaged or edited after it was written; {anew} "
             f"(or, if you know what you changed, remove its {_CHECKSUM!r})"
         )
     return content

@@ -30,7 +30,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from filelock import FileLock, Timeout, lock_descriptor
+from filelock import FileLock, Timeout
 
 from mien.disk.files import cannot_write
 from mien.disk.reading import open_handle, parse_json
@@ -68,11 +68,8 @@ def hold(*places: Path, remedy: str = WAIT) -> Iterator[None]:
     """Be the only writer of these places (folders or files, which may be missing) while the context lasts.
 
     Missing parent folders are created, and removed again if they stay empty. If the file system has no locks, this
-    warns once and continues. `remedy` is advice for the message if another process holds a place.
-
-    Raises:
-        BeingWrittenError: another process, or another thread of this one, holds a place.
-        CannotWriteError: no lock file can be written beside a place.
+    warns once and continues. A BeingWrittenError with the advice `remedy` says that another process, or another thread
+    of this one, holds a place.
     """
     with ExitStack() as stack:
         for place in sorted(set(places)):  # so that of two processes that want the same places the first gets all
@@ -166,9 +163,7 @@ def _acquire(place: Path, file: Path, remedy: str) -> Callable[[], None]:
 def _lock(file: Path) -> Callable[[], None]:
     """Lock and sign the file, which is created if it is missing. Returns what removes and unlocks it.
 
-    Raises:
-        Timeout: another process, or another thread of this one, has locked the file.
-        OSError: it cannot be opened or locked, or it was removed meanwhile.
+    A Timeout says that another process or thread has locked it, an OSError also that it was removed meanwhile.
     """
     with suppress(FileNotFoundError):
         _check_plain(file, file.lstat())
@@ -176,17 +171,7 @@ def _lock(file: Path) -> Callable[[], None]:
         begin = partial(_begin, file, held)
         lock = FileLock(file, blocking=False, thread_local=False, fallback_to_soft=False, on_acquired=begin)
         held.callback(lock.release)
-        try:
-            lock.acquire()
-        except PermissionError:
-            if not file.is_file():
-                raise
-            # Another user's file, which a kill has left. Reading is enough to lock it, but filelock also writes.
-            handle = open_handle(file, os.O_RDONLY, follow_link=False)
-            held.callback(os.close, handle)
-            if not lock_descriptor(handle, blocking=False):
-                raise Timeout(str(file)) from None
-            begin(handle)
+        lock.acquire()
         return held.pop_all().close
 
 
@@ -273,7 +258,7 @@ def _sign(handle: int, file: Path) -> None:
         "command": command[:200],
     }
     text = json.dumps(about).encode()
-    with suppress(OSError):  # a full disk, or another user's file: the lock holds even without a signature
+    with suppress(OSError):  # a full disk: the lock holds even without a signature
         os.ftruncate(handle, 0)
         write_at(handle, text, SIGNATURE_AT)
 

@@ -52,11 +52,8 @@ def expect_whole(path: Path, remedy: str) -> Iterator[None]:
 def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False, constants: bool = False) -> Any:
     """The content of a json text; a ValueError says what is wrong with it.
 
-    Args:
-        text: the text.
-        unique_names: whether an object that holds a name twice is refused, for texts that people write.
-        any_size: whether numbers of any size are allowed, because the caller checks them and can name their place.
-        constants: whether NaN and infinity are allowed, for the same reason.
+    With `unique_names`, an object that holds a name twice is refused, for texts that people write. Callers that check
+    numbers themselves, and can name their place, allow `any_size`, or the `constants` NaN and infinity.
     """
     if sum(cost * text.count(sign) for sign, cost in _COSTS.items()) > 1 << 30:  # empty lists take 20 times their text
         raise ValueError("it holds too many lists, objects or numbers")
@@ -69,21 +66,16 @@ def parse_json(text: str, *, unique_names: bool = False, any_size: bool = False,
         content = json.loads(text, **hooks)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
-    level = [content]
-    for _ in range(50):  # Python's own limit is reached only later, when the content is shown or compared
-        level = [child for node in level for child in _children(node)]
+    level: list[Any] = [[content]]
+    for _ in range(51):  # Python's own limit is reached only later, when the content is shown or compared
+        inner = [child for node in level for child in (node.values() if isinstance(node, dict) else node)]
+        level = [child for child in inner if isinstance(child, (dict, list))]
         if not level:
             return content
     raise ValueError(_TOO_DEEP)
 
 
 _TOO_DEEP = "its lists or objects are nested too deep"
-
-
-def _children(node: Any) -> Iterator[Any]:
-    """The lists and objects directly inside a node."""
-    inner = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
-    return (child for child in inner if isinstance(child, (dict, list)))
 
 
 def _refuse_constant(name: str) -> float:
@@ -115,9 +107,8 @@ def _finite_number(digits: str) -> float:
 
 def read_bytes(path: Path | str, most: int) -> bytes:
     """The bytes of an ordinary file, which may be reached through a link. A ValueError says that it has too many."""
-    handle = open_handle(path, os.O_RDONLY, follow_link=True)
-    with os.fdopen(handle, "rb") as file:
-        size = os.fstat(handle).st_size
+    with open_ordinary(path) as file:
+        size = os.fstat(file.fileno()).st_size
         if size > most:
             raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
         return file.read(size)  # not to its end, because the file may grow meanwhile
@@ -154,16 +145,9 @@ def open_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> zipfile.Zi
 
 
 def open_handle(path: Path | str, flags: int, *, follow_link: bool) -> int:
-    """The descriptor of an ordinary file. Opening never waits, not even for a process that writes into a pipe.
+    """The descriptor of an ordinary file, opened with flags of open(2). `follow_link`: whether the path may be a link.
 
-    Args:
-        path: the file. With `O_CREAT` among the flags, it is created if it is missing.
-        flags: flags of open(2).
-        follow_link: whether the path itself may be a link.
-
-    Raises:
-        NotOrdinaryError: it is a folder, a pipe, a device or a socket, or a link that is not followed.
-        OSError: it is missing or cannot be opened.
+    Opening never waits, not even for a process that writes into a pipe.
     """
     try:
         handle = os.open(path, flags | NO_WAIT | BINARY | (0 if follow_link else NO_LINK), 0o666)

@@ -93,7 +93,11 @@ def open_workspace(root: Path) -> Workspace:
         )
     check_subtrees(root, *_FOLDERS)
     if not workspace.sequence_names() and not workspace.run_names():
-        _check_first_captures(workspace)
+        from mien.disk.locks import AGAIN, check_free  # imports numpy
+
+        # Another process may be making the first sequence at this moment.
+        for file in sorted(root.glob("sequences/.*.lock")):
+            check_free(workspace.sequence_dir(file.name[1:].removesuffix(".lock")), AGAIN)
         told = f"{root}: is not a mien workspace (no sequences/NAME/capture, no runs/NAME)"
         whole = root.resolve()
         bare = sorted(path.name for path in root.glob("sequences/[!.]*") if path.is_dir())
@@ -107,14 +111,6 @@ def open_workspace(root: Path) -> Workspace:
             raise UserError(f"{told}; did you mean {shlex.join([str(typed), '--run', whole.name])}?")
         raise UserError(f"{told}; see `mien create --help`")
     return workspace
-
-
-def _check_first_captures(workspace: Workspace) -> None:
-    """Check that a workspace without a sequence is not being made at this moment by another process."""
-    from mien.disk.locks import AGAIN, check_free  # imports numpy
-
-    for file in sorted(workspace.root.glob("sequences/.*.lock")):
-        check_free(workspace.sequence_dir(file.name[1:].removesuffix(".lock")), AGAIN)
 
 
 def check_new_workspace(root: Path) -> None:

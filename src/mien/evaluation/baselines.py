@@ -47,13 +47,12 @@ class Baselines:
                 return torch.stack(alike).mean(0)
         return torch.ones(size)
 
-    def mesh_image(self, experiment: Experiment, frame: Frame, supersample: int = 2) -> Float[Tensor, "h w 3"]:
+    def mesh_image(self, experiment: Experiment, frame: Frame) -> Float[Tensor, "h w 3"]:
         """The face model posed as in a frame, with the mean vertex colours, unlit, over white."""
         face_model = experiment.avatar.face_model
         vertices = face_model(experiment.face(frame))[0]
-        image, _ = render_mesh(
-            vertices, face_model.faces, experiment.camera(frame), self.vertex_colors, supersample=supersample
-        )
+        camera = experiment.camera(frame)
+        image, _ = render_mesh(vertices, face_model.faces, camera, self.vertex_colors, supersample=2)
         return image.clamp(0, 1)
 
 

@@ -9,7 +9,6 @@ from mien.disk.files import expect_whole
 from mien.errors import UserError
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,
-    FACE_SOURCE_NAMES,
     FITTED_NAME,
     OVER_DARK_NAME,
     REMEDY,
@@ -181,7 +180,7 @@ def _differences(table: Table) -> list[str]:
     if len({row.faces for row in own}) > 1:
         warnings.append(
             f"{table.protocol}: some runs correct the tracking of held-out frames and some do not; compare the rows "
-            f"with faces {FACE_SOURCE_NAMES['as_tracked']}, or train the runs alike"
+            "with faces as tracked, or train the runs alike"
         )
     if len({(row.entry.get("perceptual_backbone"), row.entry.get("perceptual_frames")) for row in own}) > 1:
         warnings.append(
@@ -192,10 +191,10 @@ def _differences(table: Table) -> list[str]:
 
 def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
     entries = [(run, run.metrics["protocols"][protocol]) for run in runs]
-    first, names = entries[0][1], FACE_SOURCE_NAMES
-    rows = [Row(run.label, entry, run, names[entry["face_params"]]) for run, entry in entries]
+    first = entries[0][1]
+    rows = [Row(run.label, entry, run, entry["face_params"].replace("_", " ")) for run, entry in entries]
     corrected = [(run, entry) for run, entry in entries if entry["face_params"] != "as_tracked"]
-    rows += [Row(run.label, entry["as_tracked"], None, names["as_tracked"]) for run, entry in corrected]
+    rows += [Row(run.label, entry["as_tracked"], None, "as tracked") for run, entry in corrected]
     rows += [Row(run.label, entry["fitted"], None, FITTED_NAME) for run, entry in entries if "fitted" in entry]
     for key, name in BASELINE_NAMES.items():
         rows += _baseline_rows(key, name, runs, protocol)
@@ -203,7 +202,7 @@ def _table(protocol: str, runs: Sequence[ScoredRun]) -> Table:
     for run, entry in entries:
         if "over_dark" in entry:
             label = f"{run.label}, {OVER_DARK_NAME}"
-            rows.append(Row(label, entry["over_dark"], None, names[entry["face_params"]]))
+            rows.append(Row(label, entry["over_dark"], None, entry["face_params"].replace("_", " ")))
     return Table(protocol, first["split"], first["frames"], first["scored_on"], first["edges"], tuple(rows))
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mien.camera import Box
 from mien.disk.files import write_atomically
 from mien.errors import UserError
 from mien.evaluation.compare import Comparison, Row, ScoredRun, Table
@@ -27,10 +28,9 @@ from mien.evaluation.page_parts import (
 )
 from mien.evaluation.report_sections import frame_name
 from mien.machine.progress import track_progress
-from mien.media.pictures import Box, data_uri, error_heat, picture_uri, to_uint8
+from mien.media.pictures import data_uri, error_heat, picture_uri, to_uint8
 from mien.media.video import read_video_frames
-from mien.pages.pages import render
-from mien.pages.plots import Axes, Series, line_chart
+from mien.pages.pages import Axes, Series, line_chart, render
 from mien.training.footage.frames import Frame
 
 _FRAMES = 5

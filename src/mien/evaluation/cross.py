@@ -14,11 +14,12 @@ from mien.avatar.avatar import Avatar, neutral_of
 from mien.avatar.files import load_avatar
 from mien.camera import Camera
 from mien.capture.capture import Capture
+from mien.capture.person.faces import MeshReader
 from mien.capture.store import read_capture, read_capture_hash
 from mien.driving.rest import rest_before
 from mien.driving.transfer import drive
 from mien.errors import UserError
-from mien.evaluation.redetection import MEASURED_BY, FaceReader, MeasuredMotion, measure_motion, transfer_figures
+from mien.evaluation.redetection import MEASURED_BY, MeasuredMotion, measure_motion, transfer_figures
 from mien.evaluation.videos import labeled_row, match_sizes
 from mien.face.checks import check_face_params
 from mien.face.params import FaceParams, most_frontal_camera
@@ -61,7 +62,7 @@ class Driven:
 
     def driver_picture(self, timestep: int) -> UInt8[np.ndarray, "h w 3"]:
         """The driver at a timestep."""
-        return np.asarray(self.driver.images[timestep, self.driver_camera])
+        return np.ascontiguousarray(self.driver.images[timestep, self.driver_camera])
 
 
 def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
@@ -131,16 +132,16 @@ def measure(driven: Driven, name: str) -> dict[str, Any]:
     frames = evenly_spread(sorted(driven.by_rest), _MAX_FRAMES)
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     found_driver = found_avatar = 0
-    with FaceReader() as reader:
+    with MeshReader(1, is_video=False) as mesh:
         for timestep in track_progress(frames, f"driven by {name}", len(frames)):
-            theirs = reader.read(driven.driver_picture(timestep))
-            if theirs is None:
+            theirs = mesh.read(driven.driver_picture(timestep))
+            if not len(theirs):
                 continue
             found_driver += 1
-            ours = reader.read(driven.picture(timestep))
-            if ours is not None:
+            ours = mesh.read(driven.picture(timestep))
+            if len(ours):
                 found_avatar += 1
-                seen[timestep] = theirs, ours
+                seen[timestep] = theirs[0], ours[0]
     if not found_driver:
         raise UserError(f"{name}: no face is found in the driver's pictures; choose another driver")
     figures: dict[str, float | None] = dict.fromkeys(_MEANS)

@@ -19,8 +19,7 @@ from mien.evaluation.living import FILM, living, write_film
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics_file import FORMAT, VERSION, read_metrics
 from mien.evaluation.page_parts import Video, video_of
-from mien.evaluation.partial import PartialScores
-from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
+from mien.evaluation.protocols import Evaluation, EvaluationSettings, PartialScores, evaluate_frames, protocol_content
 from mien.evaluation.report_sections import cross_section
 from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads
@@ -39,21 +38,16 @@ def evaluate(
     settings: EvaluationSettings | None = None,
     driver_dirs: Items[Path] = (),
 ) -> dict[str, Any]:
-    """Score a run on its held-out frames, and write metrics.json and report.html into its folder.
+    """Score a run on its held-out frames, write metrics.json and report.html into its folder, and return the former.
 
-    Args:
-        run_dir: A finished run.
-        sequence_dirs: The folders of the sequences it was trained on, in that order.
-        settings: What to compute; None for the defaults.
-        driver_dirs: Folders of tracked sequences that drive the avatar as well.
-
-    Returns:
-        The content of metrics.json: `protocols` and `training`.
+    `sequence_dirs` are the folders of the sequences it was trained on, in that order. Those of `driver_dirs`, also
+    tracked sequences, drive the avatar as well.
     """
+    settings = settings or EvaluationSettings()
     check_tree(run_dir)
-    check_ranges(settings or EvaluationSettings(), lambda name: f"--{name.replace('_', '-')}")
+    check_ranges(settings, lambda name: f"--{name.replace('_', '-')}")
     with hold(run_dir):
-        return _evaluate(run_dir, sequence_dirs, settings or EvaluationSettings(), driver_dirs)
+        return _evaluate(run_dir, sequence_dirs, settings, driver_dirs)
 
 
 def _evaluate(

@@ -10,14 +10,12 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
-from mien.camera import Camera
+from mien.camera import Box, Camera
 from mien.face.params import FaceParams
 from mien.face.parts import part_boxes
-from mien.gaussians import Gaussians
-from mien.media.pictures import Box
+from mien.gaussians import Gaussians, Rendering
 from mien.render import rasterize
 from mien.render.closing import close_holes
-from mien.render.rendering import Rendering
 from mien.render.validation import drawable
 from mien.tracking.scoring import Scoring
 from mien.training.colors import lit

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mien.camera import Box
 from mien.disk.files import read_json, write_json
 from mien.disk.inside import listed
 from mien.errors import UserError
@@ -29,7 +30,6 @@ from mien.evaluation.scoring import (
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar, say
 from mien.media.decoding import decode_picture
-from mien.media.pictures import Box
 from mien.media.video import read_video_frames
 from mien.tracking.scoring import head_crop
 from mien.training.footage.frames import evenly_spread
@@ -47,18 +47,16 @@ class PictureSource:
 
     path: Path
     count: int
-    names: list[str] | None
-    """File names without their endings, in order. None for a video."""
-    files: dict[str, Path]
-    """Files by name. Empty for a video."""
+    files: dict[str, Path] | None
+    """Files by their names without endings, in order. None for a video."""
 
     def read(self, names: Sequence[str]) -> Iterator[UInt8[np.ndarray, "h w _"]]:
         """Yield the pictures of these names, with 3 or 4 channels. A video's pictures come in order."""
-        if self.names is None:
+        if self.files is None:
             yield from itertools.islice((picture for _, picture in read_video_frames(self.path)), len(names))
             return
         in_order = len(names) == self.count and any(name not in self.files for name in names)
-        for name in self.names if in_order else names:
+        for name in self.files if in_order else names:
             yield read_picture(self.files[name])
 
 
@@ -67,7 +65,7 @@ def open_pictures(path: Path) -> PictureSource:
     if path.is_file():
         count = sum(1 for _ in read_video_frames(path))
         say(f"warning: {path}: video compression changes pixels; png pictures give more accurate figures")
-        return PictureSource(path, count, None, {})
+        return PictureSource(path, count, None)
     if not path.is_dir():
         raise UserError(f"{path}: no such folder; name a folder of pictures, or a video")
     files: dict[str, Path] = {}
@@ -81,14 +79,14 @@ def open_pictures(path: Path) -> PictureSource:
         files[file.stem] = file
     if not files:
         raise UserError(f"{path}: contains no picture; give files that end in {', '.join(_ENDINGS)}")
-    return PictureSource(path, len(files), list(files), files)
+    return PictureSource(path, len(files), files)
 
 
 def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
     """A picture of 8 bits per channel as RGB or RGBA. Grey becomes RGB."""
     try:
         # libpng would return the upper half of a truncated file.
-        cut = path.suffix.lower() == ".png" and _end_of(path) != b"IEND\xaeB`\x82"
+        cut = path.suffix.lower() == ".png" and path.read_bytes()[-8:] != b"IEND\xaeB`\x82"
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     picture = None if cut else decode_picture(path, cv2.IMREAD_UNCHANGED)
@@ -100,12 +98,6 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "h w _"]:
         return np.repeat(picture[..., None], 3, axis=2)
     order = [2, 1, 0, 3][: picture.shape[2]]
     return np.ascontiguousarray(picture[..., order])
-
-
-def _end_of(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 8))
-        return file.read(8)
 
 
 @dataclass(frozen=True)
@@ -125,19 +117,15 @@ class ImageFolders:
     """Colour behind pictures with an alpha channel, and behind the truth outside the mattes."""
 
 
-class _Pair(NamedTuple):
-    name: str
-    image: UInt8[np.ndarray, "h w 3"]
-    truth: UInt8[np.ndarray, "h w 3"]
-    crop: Box | None
+_Pair = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"], Box | None]
+"""A picture, its truth, and the box of the head."""
 
 
 def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) -> dict[str, Any]:
     """Score pictures against their truth, matched by name, or for a video by order.
 
-    Returns:
-        The content that `write_scores` writes: mean `psnr, ssim, l1, perceptual`, the same on the `head` crop (None if
-        no crop is known), how they were computed, and `per_frame` figures.
+    The result has the means `psnr, ssim, l1, perceptual`, the same on the `head` crop (None if no crop is known), how
+    they were computed, and `per_frame` figures.
     """
     settings = settings or ScoreSettings()
     pairs = _Pairs(folders)
@@ -145,14 +133,13 @@ def score_folders(folders: ImageFolders, settings: ScoreSettings | None = None) 
     judged = set(evenly_spread(range(len(pairs.names)), settings.perceptual_frames))
 
     def score(job: tuple[int, _Pair]) -> Scores:
-        index, pair = job
-        own = {"image": _floats(pair.image)}
+        index, (image, truth, crop) = job
         judges = (metric, lpips) if index in judged else (None, None)
-        return score_pictures(own, _floats(pair.truth), pair.crop, judges[0], lpips=judges[1])["image"]
+        return score_pictures({"image": _floats(image)}, _floats(truth), crop, judges[0], lpips=judges[1])["image"]
 
     rows: list[Scores] = []
     with progress_bar("score", len(pairs.names)) as advance:
-        for row in stream_in_threads(score, pairs.read(), worker_threads(settings.threads)):
+        for row in stream_in_threads(score, enumerate(pairs.read()), worker_threads(settings.threads)):
             rows.append(row)
             advance()
     return {
@@ -215,19 +202,20 @@ class _Pairs:
         known = "box of each matte" if self._mattes is not None else None
         self.crop_source = known if crops_path is None else "frozen head box of each frame"
 
-    def read(self) -> Any:
-        """Yield (index, pair) for every picture."""
+    def read(self) -> Iterator[_Pair]:
+        """Yield every picture with its truth."""
         color = np.full(3, _COLORS[self._folders.background], np.uint8)
         images = self._images.read(self.names)
         truths = self._truth.read(self.names)
         mattes = None if self._mattes is None else self._mattes.read(self.names)
         surround: list[float] = []
-        for index, name in enumerate(self.names):
+        for name in self.names:
             image, truth = _flat(next(images), color), _flat(next(truths), color)
             self._check_size(name, image, truth, self._folders.images)
             crop = None if self._crops is None else self._crops[name]
             if mattes is not None:
-                matte = _opacity(next(mattes))
+                picture = next(mattes)
+                matte = np.ascontiguousarray(picture[..., 3 if picture.shape[2] == 4 else 1])  # opacity, or brightness
                 self._check_size(name, matte, truth, self._folders.mattes)
                 truth = composite(truth, matte, color)
                 crop = crop or _box(matte)
@@ -235,7 +223,7 @@ class _Pairs:
                     surround.append(float(np.abs(image[matte == 0].astype(np.int16) - int(color[0])).mean()))
             if crop is not None and not _meets(crop, truth):
                 raise UserError(f"{name}: the head box {crop} is outside the picture; write {CROPS_NAME} again")
-            yield index, _Pair(name, image, truth, crop)
+            yield image, truth, crop
         if surround and float(np.mean(surround)) > 64:
             say(
                 f"warning: {self._folders.images}: pictures are not {self._folders.background} where the mattes are "
@@ -253,24 +241,24 @@ class _Pairs:
 
 def _matched(truth: PictureSource, images: PictureSource) -> list[str]:
     """The names to score, in order. They are the names of the truth."""
-    if truth.names is None or images.names is None:
+    if truth.files is None or images.files is None:
         # Frames of a video have no names, so they match by order.
         if truth.count != images.count:
             raise UserError(
                 f"{images.path}: has {images.count} pictures, {truth.path} has {truth.count}; videos are matched by "
                 "order, so give equal numbers"
             )
-        return truth.names or images.names or [f"{index:06d}" for index in range(truth.count)]
-    missing = sorted(set(truth.names) - set(images.names))
+        return list(truth.files or images.files or (f"{index:06d}" for index in range(truth.count)))
+    missing = sorted(set(truth.files) - set(images.files))
     if missing:
         raise UserError(
             f"{images.path}: lacks {len(missing)} of the {truth.count} pictures of {truth.path} ({_listed(missing)}; "
-            f"it has {_listed(images.names)}); give pictures the names of their truths"
+            f"it has {_listed([*images.files])}); give pictures the names of their truths"
         )
-    extra = len(images.names) - len(truth.names)
+    extra = len(images.files) - len(truth.files)
     if extra:
         say(f"warning: {images.path}: {extra} pictures have no truth in {truth.path} and are left out")
-    return truth.names
+    return list(truth.files)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -286,11 +274,6 @@ def _flat(picture: UInt8[np.ndarray, "h w _"], color: UInt8[np.ndarray, " 3"]) -
     if picture.shape[2] == 4:
         return composite(picture[..., :3], picture[..., 3], color)
     return picture
-
-
-def _opacity(picture: UInt8[np.ndarray, "h w _"]) -> UInt8[np.ndarray, "h w"]:
-    """A matte from its picture: the alpha channel if there is one, or else the brightness."""
-    return np.ascontiguousarray(picture[..., 3] if picture.shape[2] == 4 else picture[..., 1])
 
 
 def _box(matte: UInt8[np.ndarray, "h w"]) -> Box:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 
 from mien.avatar.files import load_avatar
 from mien.capture.store import read_capture_hash
@@ -54,7 +53,8 @@ def load_experiments(
         if _digests(folder) != digest:
             raise UserError(f"{folder}: was changed while it was read; run the same command again")
     check_data(run_dir, {sequence.name: sequence.tracking for sequence in sequences})
-    clothes = _clothes(sequence_dirs, sequences) if rules is not None and rules.opened else ()
+    shapes = ((mattes.shape[0], *mattes.shape[2:]) for mattes in (sequence.capture.mattes for sequence in sequences))
+    clothes = tuple(map(read_clothes, sequence_dirs, shapes)) if rules is not None and rules.opened else ()
     scored = [{**each, **({"mask": "matte"} if whole else {})} for each in digests]
     for each, packed in zip(scored, clothes, strict=False):
         each |= {} if packed is None else {"clothes": clothes_digest(packed)}
@@ -84,14 +84,6 @@ def load_experiments(
         name: replace(base, held_out_frames=frames, split=split, face_source=_face_source(sequences, faces, frames))
         for name, (split, frames) in found.items()
     }
-
-
-def _clothes(folders: Items[Path], sequences: Items[Sequence]) -> tuple[UInt8[np.ndarray, "t h p"] | None, ...]:
-    """The packed masks of clothes of each sequence."""
-    shapes = (sequence.capture.mattes.shape for sequence in sequences)
-    return tuple(
-        read_clothes(folder, (t, height, width)) for folder, (t, _, height, width) in zip(folders, shapes, strict=True)
-    )
 
 
 def _digests(folder: Path) -> dict[str, str]:

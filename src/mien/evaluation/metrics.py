@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from mien.media.pictures import Box
+from mien.camera import Box
 from mien.training.losses import C1, C2, WINDOW_RADIUS, WINDOW_SIGMA
 
 Border = Literal["zeros", "inside"]

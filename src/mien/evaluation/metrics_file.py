@@ -20,8 +20,6 @@ PART_NAMES = {"eyes": "Eyes", "mouth": "Mouth"}
 """Headings of the parts of the face that have figures of their own, by their keys in metrics.json."""
 BASELINE_NAMES = {"mean_frame": "mean training picture", "mesh": "coloured mesh"}
 """Names of the baselines, by their keys in metrics.json."""
-FACE_SOURCE_NAMES = {"corrected": "corrected", "as_tracked": "as tracked"}
-"""Names for the source of held-out face parameters: tracking with corrections from training, or tracking alone."""
 FITTED_NAME = "fitted to the scored pictures"
 """Name for face parameters that were fitted to the held-out frames themselves. They are never the headline."""
 OVER_DARK_NAME = "over dark blue"

@@ -1,8 +1,11 @@
 """Protocols with true pictures: the avatar and both baselines on the same held-out frames, by the same metrics."""
 
+import contextlib
+import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal
 
@@ -12,7 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.avatar.avatar import frozen
+from mien.avatar.settings import FaceTuning, Progress
 from mien.disk.config import Range
+from mien.disk.files import write_atomically
+from mien.disk.inside import open_to_append
+from mien.disk.reading import parse_json, read_bytes
 from mien.evaluation.baselines import Baselines, look_at_trained, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import (
@@ -24,11 +32,10 @@ from mien.evaluation.experiment import (
     drawn_image,
     posed_avatar,
     scored_on,
+    target_image,
     target_images,
 )
-from mien.evaluation.fitting import LOSS, FittedFaces
 from mien.evaluation.metrics import Border
-from mien.evaluation.partial import PartialScores
 from mien.evaluation.scoring import (
     PART_SIDE,
     PIXELS,
@@ -42,10 +49,15 @@ from mien.evaluation.scoring import (
     score_pictures,
     worker_threads,
 )
+from mien.face.params import FaceParams
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
+from mien.render import rasterize
+from mien.training.adam import Adam
+from mien.training.footage.face_track import FaceTrack
 from mien.training.footage.frames import Frame, spread_frames
+from mien.training.losses import photometric_loss
 
 AVATAR, AS_TRACKED, FITTED, MEAN_FRAME, MESH = "avatar", "as_tracked", "fitted", "mean_frame", "mesh"
 OPENED, UNCLOTHED, OVER_DARK = "opened", "without_clothes", "over_dark"
@@ -59,6 +71,9 @@ _MASKS = {
 _MATTES = "the dataset's mattes, whole, over white"
 _CROP = "frozen head box of each frame"
 _PART_CROPS = f"boxes of the tracked mesh; enlarged to {PART_SIDE} pixels for ST-LPIPS if a side is shorter"
+_FIT_LOSS = "mean absolute difference of colours over the whole picture"
+_FIT_RATES = FaceTuning(within_bounds=True)
+"""Learning rates for every method alike: those with which training corrects the tracking by default."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +137,50 @@ class Evaluation:
         return sorted(range(len(figures)), key=figures.__getitem__)
 
 
+Scored = tuple[dict[str, Scores], float]
+"""A frame's figures by the scored subject, and the seconds that rendering the avatar took."""
+
+
+@dataclass(frozen=True)
+class PartialScores:
+    """A file with one line per scored frame, after a first line with the fingerprint of the evaluation."""
+
+    path: Path
+    fingerprint: str
+    """Identity of the evaluation. Figures of any other evaluation are dropped."""
+
+    def read(self) -> dict[Frame, Scored]:
+        """The frames that were scored before. Empty if the file is of another run or other settings, or is damaged.
+
+        Cuts the file back to its good lines, because a killed process may leave half a line. Creates the file if
+        needed.
+        """
+        good: list[str] = [json.dumps({"scores_of": self.fingerprint})]
+        found: dict[Frame, Scored] = {}
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
+            first, *lines = read_bytes(self.path, 256 << 20).decode("utf-8", "replace").split("\n")
+            for line in lines if first == good[0] else ():
+                content = parse_json(line)
+                rows: dict[str, Scores] = {
+                    name: {key: float(row[key]) for key in row} for name, row in content["scores"].items()
+                }
+                found[Frame(*content["frame"])] = (rows, float(content["seconds"]))
+                good.append(line)
+        text = "\n".join(good) + "\n"
+        write_atomically(self.path, lambda aside: aside.write_text(text, encoding="utf-8"))
+        return found
+
+    def add(self, frame: Frame, scores: Mapping[str, Scores], seconds: float) -> None:
+        """Append one more frame."""
+        line = json.dumps({"frame": list(frame), "scores": dict(scores), "seconds": seconds})
+        with open_to_append(self.path) as file:
+            file.write(line + "\n")
+
+    def remove(self) -> None:
+        """Delete the file, because the figures are in metrics.json now."""
+        self.path.unlink(missing_ok=True)
+
+
 def evaluate_frames(
     experiment: Experiment, settings: EvaluationSettings, partial: PartialScores | None = None, title: str = "evaluate"
 ) -> Evaluation:
@@ -137,13 +196,17 @@ def evaluate_frames(
     subjects |= {OPENED} if settings.opened else set()
     subjects |= {OVER_DARK} if settings.over_dark(experiment) else set()
     kept = partial.read() if partial is not None else {}
-    done = {frame: scored for frame, scored in kept.items() if _is_complete(scored[0], subjects)}
+    done = {  # with all subjects, and every figure that each frame must have
+        frame: scored
+        for frame, scored in kept.items()
+        if scored[0].keys() - {UNCLOTHED} == subjects and all(row.keys() >= _ALWAYS for row in scored[0].values())
+    }
     metric, lpips = perceptual_metric(settings), lpips_metric(settings)
     perceptual_frames = set(spread_frames(frames, settings.perceptual_frames))
     threads = worker_threads(settings.threads)
     means, training_psnr = look_at_trained(experiment, _MAX_TRAINING_FRAMES, threads, mean=settings.baselines)
     baselines = make_baselines(experiment, threads, means) if settings.baselines else None
-    fitted = FittedFaces(experiment, settings.fit_steps) if settings.fit_faces else None
+    fit_steps = settings.fit_steps if settings.fit_faces else 0
 
     def score(job: tuple[Frame, dict[str, Tensor], float]) -> tuple[Frame, dict[str, Scores], float]:
         frame, drawn, seconds = job
@@ -164,7 +227,9 @@ def evaluate_frames(
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = drawn_frames(experiment, [frame for frame in frames if frame not in done], subjects, baselines, fitted)
+        jobs = drawn_frames(
+            experiment, [frame for frame in frames if frame not in done], subjects, baselines, fit_steps
+        )
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:
@@ -177,19 +242,18 @@ def evaluate_frames(
     return Evaluation(frames, scores, seconds[len(seconds) // 2], baselines, training_psnr)
 
 
-def _is_complete(scores: Mapping[str, Scores], subjects: set[str]) -> bool:
-    """Whether all subjects are scored, with every figure that each frame must have."""
-    return scores.keys() - {UNCLOTHED} == subjects and all(row.keys() >= _ALWAYS for row in scores.values())
-
-
 def drawn_frames(
     experiment: Experiment,
     frames: list[Frame],
     subjects: set[str],
     baselines: Baselines | None,
-    fitted: FittedFaces | None,
+    fit_steps: int,
 ) -> Iterator[tuple[Frame, dict[str, Tensor], float]]:
-    """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar."""
+    """Yield each frame with its pictures to score, by name, and the seconds to pose and render the avatar.
+
+    With `fit_steps`, the face of each timestep is also fitted to all of its held-out pictures, in so many steps.
+    """
+    fitted: dict[tuple[int, int], FaceParams] = {}
     as_tracked = None if experiment.face_source == "as_tracked" else _as_tracked(experiment)
     for frame in frames:
         start = time.perf_counter()
@@ -198,16 +262,50 @@ def drawn_frames(
         seconds = time.perf_counter() - start
         if as_tracked is not None:
             drawn[AS_TRACKED] = avatar_image(as_tracked, frame)
-        if fitted is not None:
-            drawn[FITTED] = avatar_image(experiment, frame, fitted.face(frame))
+        if fit_steps:
+            key = frame.sequence, frame.timestep
+            if key not in fitted:
+                together = [each for each in experiment.held_out_frames if (each.sequence, each.timestep) == key]
+                fitted[key] = fit_face(experiment, together, fit_steps)
+            drawn[FITTED] = avatar_image(experiment, frame, fitted[key])
         if OVER_DARK in subjects:
             drawn[OVER_DARK] = drawn_image(experiment, frame, posed, DARK)
         if OPENED in subjects:
-            drawn[OPENED] = opened(drawn[AVATAR] if fitted is None else drawn[FITTED])
+            drawn[OPENED] = opened(drawn[FITTED if fit_steps else AVATAR])
         if baselines is not None:
             drawn[MEAN_FRAME] = baselines.mean_frame_image(experiment, frame)
             drawn[MESH] = baselines.mesh_image(experiment, frame)
         yield frame, drawn, seconds
+
+
+def fit_face(experiment: Experiment, frames: list[Frame], steps: int) -> FaceParams:
+    """Expression, joints, head rotation and head translation of one timestep, after some steps of Adam.
+
+    MonoGaussianAvatar (Chen et al. 2024, supplement B.4) is scored in this way. The figure shows what the avatar can
+    draw if its tracking is right. It uses the pixels that are scored, so it is no figure of a prediction.
+
+    `frames` are those of one timestep, from different cameras, and are fitted together. The start are the face
+    parameters of the headline. The loss is the mean absolute difference of colours, summed over the frames. Expression
+    coefficients stay within the bounds of the face model, or where the tracking left them.
+    """
+    avatar = experiment.avatar
+    targets = [(frame, target_image(experiment, frame)) for frame in frames]
+    track = FaceTrack(experiment.face(frames[0]), _FIT_RATES, bounds=avatar.face_model.expression_bounds)
+    adam = Adam()
+    with torch.enable_grad(), frozen(avatar):
+        for step in range(steps):
+            gaussians = avatar.pose(track.face(0)).gaussians.timestep(0)
+            white = torch.ones(3).to(gaussians.means)
+            drawn = [(frame, rasterize(gaussians, experiment.camera(frame), white)) for frame, _ in targets]
+            images = [experiment.lit(picture, white, frame).image for frame, picture in drawn]
+            losses = [
+                photometric_loss(image, target, l1_weight=1.0, ssim_weight=0.0)
+                for image, (_, target) in zip(images, targets, strict=True)
+            ]
+            torch.autograd.backward(losses)
+            adam.step(track.parameter_groups(0), Progress(step, steps))
+            track.confine(0)
+    return track.face(0).detach()
 
 
 def opened(picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -241,7 +339,7 @@ def protocol_content(experiment: Experiment, evaluation: Evaluation, settings: E
     if OVER_DARK in further:
         further[OVER_DARK]["color"] = list(DARK)
     if FITTED in further:
-        further[FITTED]["fit"] = {"steps": settings.fit_steps, "loss": LOSS}
+        further[FITTED]["fit"] = {"steps": settings.fit_steps, "loss": _FIT_LOSS}
     for name in (OPENED, UNCLOTHED):
         if name in scores:
             further[name] = {**mean_scores(scores[name]), "frames": len(scores[name])}

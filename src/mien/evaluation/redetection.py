@@ -6,12 +6,10 @@ corners. Neither identity nor head pose count, only what moves. The same detecto
 """
 
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from mien.capture.person.faces import MeshReader
 from mien.rotation import align_centered
 from mien.tracking.landmarks.groups import BROWS, EYE_CORNERS, LEFT_EYELIDS, LIPS, NOSE, RIGHT_EYELIDS
 
@@ -21,24 +19,6 @@ _MOVING = np.array(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + BROWS)
 _OUTER_CORNERS = (33, 263)
 _MOUTH = ((13, 14),)
 _EYES = ((159, 145), (386, 374))
-
-
-class FaceReader:
-    """Detects landmarks in single pictures. Use as a context manager."""
-
-    def __enter__(self) -> "FaceReader":
-        self._mesh = MeshReader(1, is_video=False).__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._mesh.__exit__(kind, error, traceback)
-
-    def read(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 3"] | None:
-        """Landmarks in pixels (z, away from the camera, in the same unit), or None if no face is found."""
-        faces = self._mesh.read(np.ascontiguousarray(image))
-        return faces[0] if len(faces) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 
 from mien.avatar.avatar import Avatar
+from mien.camera import Box
 from mien.evaluation.experiment import DARK, Experiment, avatar_image, head_box, target_image
 from mien.evaluation.living import SIDE, Living, strip, to_bytes
 from mien.evaluation.metrics import crop_to
 from mien.evaluation.metrics_file import BASELINE_NAMES, OVER_DARK_NAME
 from mien.evaluation.page_parts import Card, Cell, DataTable, Picture, figure_text, picture_of, video_of
 from mien.evaluation.protocols import AVATAR, MESH, OVER_DARK, Evaluation
-from mien.media.pictures import Box, error_heat, picture_uri, to_uint8
-from mien.pages.plots import Axes, Series, line_chart
+from mien.media.pictures import error_heat, picture_uri, to_uint8
+from mien.pages.pages import Axes, Series, line_chart
 from mien.render.mesh import render_mesh
 from mien.training.footage.coverage import Coverage
 from mien.training.footage.filmed import confidence_picture, filmed_words

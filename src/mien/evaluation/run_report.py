@@ -5,7 +5,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -55,67 +54,51 @@ def write_report(
     run: RunRecord,
     protocols: Mapping[str, Any],
     results: Mapping[str, tuple[Experiment, Evaluation]],
-    videos: Mapping[str, Video] = MappingProxyType({}),
-    driven: Mapping[str, Any] | None = None,
-    alive: Living | None = None,
+    videos: Mapping[str, Video],
+    driven: Mapping[str, Any] | None,
+    alive: Living | None,
 ) -> None:
     """Write the page of a run.
 
-    `protocols` is that of metrics.json, and `driven` the section on cross-reenactment
-    (`report_sections.cross_section`). The film of `alive` lies beside the page.
+    `protocols` is that of metrics.json, `videos` holds a video by protocol, and `driven` is the section on
+    cross-reenactment (`report_sections.cross_section`). The film of `alive` lies beside the page.
     """
     first = next(iter(results.values()), None)
-    hero = sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None
-    page = f"../../{LIVING_PAGE}" if (path.parent / "../.." / LIVING_PAGE).is_file() else None
     with expect_whole(path.parent, "train and evaluate it again"):
-        text = report_html(run, protocols, results, videos, driven, hero, page)
+        command_line = list(run.config["command_line"])
+        command_line[:1] = [Path(program).name for program in command_line[:1]]  # without the folder of the program
+        backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
+        text = render(
+            "evaluation/templates/report.html",
+            title=f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}",
+            name=run.name,
+            version=run.config["mien"],
+            command=shlex.join(command_line),
+            hero=sections.hero(alive, path.parent / FILM, first) if alive is not None and first is not None else None,
+            page=f"../../{LIVING_PAGE}" if (path.parent / "../.." / LIVING_PAGE).is_file() else None,
+            tiles=_tiles(run, protocols),
+            tables=_tables(protocols),
+            fitted=any("fitted" in entry for entry in protocols.values()),
+            backbones=", ".join(sorted(backbones)) or "not computed",
+            protocols=[_protocol(name, *result, videos.get(name)) for name, result in results.items()],
+            driven=driven,
+            training=sections.training_curves(run.curves),
+            filmed=sections.confidence(first[0].avatar, run.coverage) if first and run.coverage is not None else None,
+            tracking=sections.tracking_overlays(first[0]) if first else None,
+            memory=f"{run.summary['peak_memory_mb']:,.0f}",
+            config=json.dumps({**run.config, "command_line": command_line}, indent=1),
+        )
     write_atomically(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
 
-def report_html(
-    run: RunRecord,
-    protocols: Mapping[str, Any],
-    results: Mapping[str, tuple[Experiment, Evaluation]],
-    videos: Mapping[str, Video] = MappingProxyType({}),
-    driven: Mapping[str, Any] | None = None,
-    hero: Mapping[str, Any] | None = None,
-    page: str | None = None,
-) -> str:
-    """The page as text. `videos` holds a video by protocol, and `page` is the address of the living avatar's page."""
-    command_line = list(run.config["command_line"])
-    command_line[:1] = [Path(program).name for program in command_line[:1]]  # without the folder of the program
-    first = next(iter(results.values()), None)
-    shown = [
-        {
-            "title": PROTOCOL_NAMES.get(name, name),
-            "comparison": sections.comparison(experiment, evaluation),
-            "video": videos.get(name),
-            "over_time": sections.over_time(experiment, evaluation),
-            "baselines": sections.baseline_pictures(experiment, evaluation),
-        }
-        for name, (experiment, evaluation) in results.items()
-    ]
-    backbones = {entry["perceptual_backbone"] for entry in protocols.values()} - {None}
-    return render(
-        "evaluation/templates/report.html",
-        title=f"{', '.join(entry['sequence'] for entry in run.config['data'])} · {run.config['method']['kind']}",
-        name=run.name,
-        version=run.config["mien"],
-        command=shlex.join(command_line),
-        hero=hero,
-        page=page,
-        tiles=_tiles(run, protocols),
-        tables=_tables(protocols),
-        fitted=any("fitted" in entry for entry in protocols.values()),
-        backbones=", ".join(sorted(backbones)) or "not computed",
-        protocols=shown,
-        driven=driven,
-        training=sections.training_curves(run.curves),
-        filmed=sections.confidence(first[0].avatar, run.coverage) if first and run.coverage is not None else None,
-        tracking=sections.tracking_overlays(first[0]) if first else None,
-        memory=f"{run.summary['peak_memory_mb']:,.0f}",
-        config=json.dumps({**run.config, "command_line": command_line}, indent=1),
-    )
+def _protocol(name: str, experiment: Experiment, evaluation: Evaluation, video: Video | None) -> dict[str, Any]:
+    return {
+        "title": PROTOCOL_NAMES.get(name, name),
+        "comparison": sections.comparison(experiment, evaluation),
+        "video": video,
+        "over_time": sections.over_time(experiment, evaluation),
+        "baselines": sections.baseline_pictures(experiment, evaluation),
+    }
 
 
 def _tiles(run: RunRecord, protocols: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mien.camera import Box
 from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
 from mien.face.parts import PARTS
 from mien.machine.threads import asked_threads
-from mien.media.pictures import Box, to_uint8
+from mien.media.pictures import to_uint8
 from mien.pages.pages import METRICS
 from mien.perceptual.distance import MIN_SIDE, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips
@@ -87,17 +88,10 @@ def score_pictures(
     border: Border = "zeros",
     compared: Container[str] | None = None,
 ) -> dict[str, Scores]:
-    """The figures of several pictures against one target, on the whole frame and on the crops that are given.
+    """The figures of several pictures, 0..1, against one target: on the whole frame, the head `crop` and the `parts`.
 
-    Args:
-        pictures: The pictures by name, 0..1.
-        target: The true picture.
-        crop: The box of the head.
-        metric: ST-LPIPS, or None. It skips a picture or a head that is too small for it.
-        parts: The boxes of eyes and mouth, by name. ST-LPIPS enlarges those with a side below `PART_SIDE` to it.
-        lpips: Exact LPIPS, or None. It skips and enlarges the same crops.
-        border: Windows of SSIM at the border of a picture or crop.
-        compared: Names of the pictures that get ST-LPIPS and LPIPS. None means all.
+    `metric` (ST-LPIPS) and `lpips` skip a picture or a head that is too small for them, and enlarge parts with a side
+    below `PART_SIDE` to it. They judge the pictures that `compared` names, or all.
     """
     metrics = [(name, each) for name, each in (("perceptual", metric), (LPIPS, lpips)) if each is not None]
     rows: dict[str, dict[str, float]] = {name: {} for name in pictures}

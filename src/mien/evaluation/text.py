@@ -5,7 +5,7 @@ from typing import Any
 
 from mien.evaluation.compare import Comparison, Row, Table
 from mien.evaluation.compare_report import costs, row_cells
-from mien.evaluation.metrics_file import BASELINE_NAMES, FACE_SOURCE_NAMES, FITTED_NAME, OVER_DARK_NAME
+from mien.evaluation.metrics_file import BASELINE_NAMES, FITTED_NAME, OVER_DARK_NAME
 from mien.machine.terminal import printable
 from mien.pages.pages import COLUMNS
 
@@ -17,9 +17,9 @@ _PARTS = ((None, "whole frame"), ("head", "head crop"))
 
 def protocol_lines(name: str, entry: Mapping[str, Any]) -> list[str]:
     """The PSNR of a protocol of metrics.json: a heading, then a line for the avatar and for each baseline."""
-    rows = {f"avatar, faces {FACE_SOURCE_NAMES[entry['face_params']]}": entry}
+    rows = {f"avatar, faces {entry['face_params'].replace('_', ' ')}": entry}
     if entry["face_params"] != "as_tracked":
-        rows[f"avatar, faces {FACE_SOURCE_NAMES['as_tracked']}"] = entry["as_tracked"]
+        rows["avatar, faces as tracked"] = entry["as_tracked"]
     if "over_dark" in entry:
         rows[f"avatar, {OVER_DARK_NAME}"] = entry["over_dark"]
     if "fitted" in entry:

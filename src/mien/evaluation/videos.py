@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
+from mien.camera import Box
 from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
 from mien.evaluation.metrics import crop_to
@@ -15,7 +16,7 @@ from mien.evaluation.protocols import AVATAR, Evaluation
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
 from mien.media.picture_files import write_png
-from mien.media.pictures import WHITE, Box, error_heat, shrink, side_by_side, to_uint8
+from mien.media.pictures import WHITE, error_heat, shrink, side_by_side, to_uint8
 from mien.media.video import write_video
 from mien.training.footage.frames import Frame
 
@@ -102,13 +103,8 @@ def write_scored_pictures(folder: Path, experiment: Experiment) -> None:
     crops: dict[str, Box] = {}
     frames = experiment.held_out_frames
     for frame in track_progress(frames, f"pictures {folder.name}", len(frames)):
-        name = picture_name(experiment, frame)
+        name = f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"
         crops[name] = experiment.crop(frame)
         write_png(folder / "truth" / f"{name}.png", to_uint8(target_image(experiment, frame)))
         write_png(folder / "rendering" / f"{name}.png", to_uint8(avatar_image(experiment, frame)))
     write_crops(folder / "truth" / CROPS_NAME, crops)
-
-
-def picture_name(experiment: Experiment, frame: Frame) -> str:
-    """File name of a frame, without its ending."""
-    return f"{experiment.sequences[frame.sequence].name}_{experiment.camera_id(frame)}_{frame.timestep:06d}"

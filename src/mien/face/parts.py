@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.camera import Camera
+from mien.camera import Box, Camera
 from mien.face.model import FaceModel
 
 _EYES_MARGIN = 0.12  # margin around the eyes' regions on each side, relative to the width of the part. Set by eye
@@ -14,8 +14,6 @@ _PART_LEAST_COSINE = 0.3
 which the part counts as seen."""
 _PART_LEAST_SIDE = 8  # smallest side of a part's box, in pixels. Smaller parts show nothing
 
-Box = tuple[int, int, int, int]
-"""Left, top, width and height in pixels: `mien.media.pictures.Box`, without its import of OpenCV."""
 PARTS = ("eyes", "mouth")
 """Names of the parts. The eyes are one part."""
 _REGIONS = {"eyes": ("eyelids", "eyes", "irises"), "mouth": ("lips",)}

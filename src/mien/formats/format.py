@@ -89,6 +89,20 @@ class PoseOptions(MotionOptions):
     eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
 
 
+@dataclass(frozen=True)
+class SplatOptions(PoseOptions):
+    """Options of files whose usual viewers take +y for down."""
+
+    y_down: bool = False
+    """Turn the head by half a turn about x, for viewers that take +y for down and would show it upside down."""
+
+    def pose(self, content: Content) -> "mien.gaussians.Gaussians":
+        """Return the Gaussians as they are written."""
+        from mien.formats.shared.world_space import with_y_down
+
+        return with_y_down(content.pose()) if self.y_down else content.pose()
+
+
 def check_options(path: Path, options: NoOptions) -> None:
     """Check that there is a motion if something is said of it."""
     if isinstance(options, MotionOptions):

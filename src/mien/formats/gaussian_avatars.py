@@ -27,10 +27,10 @@ from mien.disk.limits import MAX_NUMBER, is_moderate
 from mien.errors import UserError
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.face.model import FaceModel
+from mien.face.models.flame_params import read_flame_params, write_flame_params
 from mien.face.params import FaceParams
 from mien.formats.format import Content, NoOptions
 from mien.formats.ply import BINDING, property_names, read_columns, stacked, stacked_sh, write_rows
-from mien.formats.shared.flame_params import read_flame_params, write_flame_params
 from mien.runtime.baked import MeshBound
 
 POINTS, PARAMETERS, MODEL = "point_cloud.ply", "flame_param.npz", "face_model"

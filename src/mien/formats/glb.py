@@ -18,6 +18,7 @@ from mien.errors import UserError
 from mien.formats.format import Content, NoOptions
 from mien.formats.shared.glb_file import INDICES, VERTICES, Glb, GlbWriter, read_glb
 from mien.formats.shared.splats import unit_quats
+from mien.machine import exact
 from mien.runtime.baked import MeshBound, PortableAvatar, Rig
 from mien.runtime.file import from_arrays, to_arrays
 from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
@@ -194,7 +195,8 @@ def _mesh_content(
     corners, index = np.unique(pairs, axis=0, return_inverse=True)
     points, coordinates = corners[:, 0], corners[:, 1]
     uv = model.uv[coordinates] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
-    normals = _normals(vertices, model.faces)
+    normals = exact.vertex_normals(vertices, model.faces)
+    normals[(normals == 0).all(1)] = (0, 0, 1)  # a vertex whose triangles have no area
     joints, weights = _skinning(model.rig.skinning_weights)
     attributes = {
         "POSITION": writer.accessor(vertices[points], VERTICES, bounds=True),
@@ -215,17 +217,6 @@ def _mesh_content(
     else:
         del primitive["targets"]
     return {"meshes": [mesh]}
-
-
-def _normals(vertices: Float32[np.ndarray, "m 3"], faces: Int[np.ndarray, "f 3"]) -> Float32[np.ndarray, "m 3"]:
-    """Unit normals of the vertices. One without a triangle that has an area points ahead."""
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    areas, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], areas)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit = np.where(lengths > 1e-20, normals / np.maximum(lengths, 1e-20), (0.0, 0.0, 1.0))
-    return unit.astype(np.float32)
 
 
 def _skinning(weights: Float32[np.ndarray, "m k"]) -> tuple[np.ndarray, Float32[np.ndarray, "m 4"]]:
@@ -277,7 +268,8 @@ def _add_texture(writer: GlbWriter, content: dict[str, Any], texture: Float32[np
 
 def _add_splats(writer: GlbWriter, content: dict[str, Any], avatar: PortableAvatar, gaussians: Gaussians) -> None:
     """Add the Gaussians at rest as a second mesh, with a node of its own as the last one."""
-    linear = _linear(np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1))
+    colors = np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1)
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # from sRGB
     shown = np.concatenate([linear, gaussians.opacities[:, None]], axis=1)
     attributes = {
         "POSITION": writer.accessor(gaussians.means, VERTICES, bounds=True),
@@ -296,11 +288,6 @@ def _add_splats(writer: GlbWriter, content: dict[str, Any], avatar: PortableAvat
     primitive = {"mode": 0, "attributes": attributes, "extensions": extension}
     content["meshes"].append({"name": "gaussians", "primitives": [primitive], "extras": {"animates": _ANIMATES}})
     content["nodes"].append({"name": "gaussians", "mesh": 1})
-
-
-def _linear(colors: np.ndarray) -> np.ndarray:
-    """Linear light of colours in sRGB, both 0..1."""
-    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
 def _avatar_extension(path: Path, writer: GlbWriter, avatar: PortableAvatar) -> dict[str, Any]:

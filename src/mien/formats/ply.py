@@ -14,8 +14,8 @@ from mien.disk.files import write_atomically
 from mien.disk.limits import rigid_fault
 from mien.disk.reading import open_ordinary
 from mien.errors import UserError
-from mien.formats.format import Content, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, SplatOptions
+from mien.formats.format import Content, SplatOptions, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS
 
 if TYPE_CHECKING:
     import mien.gaussians
@@ -208,20 +208,14 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
             break
         if line.startswith("property"):
             properties.append(line.split())
-    others = [" ".join(entry) for entry in properties if not _is_known_type(entry)]
+    known = [len(entry) == 3 and entry[1] in (_FLOATS if _READ.fullmatch(entry[2]) else _TYPES) for entry in properties]
+    others = [" ".join(entry) for entry, is_known in zip(properties, known, strict=True) if not is_known]
     names = [entry[-1] for entry in properties]
     missing = [name for name in ("x", "f_dc_0", "opacity", "scale_0", "rot_0") if name not in names]
     if missing or others:
         reason = f"lacks {', '.join(missing)}" if missing else f"has {others[0]!r}, not float"
         raise UserError(f"{path}: {reason}; give a .ply with 3D Gaussians in full precision")
     return int(elements[0][2]), np.dtype([(entry[2], _TYPES[entry[1]]) for entry in properties])
-
-
-def _is_known_type(entry: list[str]) -> bool:
-    """Whether a property line, split into words, is of a type that its name may have."""
-    if len(entry) != 3:
-        return False
-    return entry[1] in (_FLOATS if _READ.fullmatch(entry[2]) else _TYPES)
 
 
 def _pose_of(path: Path, lines: list[str]) -> Float32[np.ndarray, "4 4"] | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mien.formats.format import Format, NoOptions
+from mien.formats.format import Format, NoOptions, SplatOptions
 from mien.plugins import named, plugin, with_plugins
 
 
@@ -35,7 +35,7 @@ _OWN = (
     Format("vrm", "avatar", _of("vrm:write"), (".vrm",), options=NoOptions),
     Format("ply", "pose", _of("ply:write"), (".ply",), options=_of("ply:PlyOptions")),
     Format("spz", "pose", _of("spz:write"), (".spz",), options=_of("spz:SpzOptions")),
-    Format("sog", "pose", _of("sog:write"), (".sog",), options=_of("shared.splats:SplatOptions")),
+    Format("sog", "pose", _of("sog:write"), (".sog",), options=SplatOptions),
     Format("usd", "sequence", _of("usd:write"), _USD, check=_of("usd:check_usd_options")),
     Format("gaussian-avatars", "folder", _of("gaussian_avatars:write"), options=NoOptions),
 )

@@ -16,8 +16,8 @@ from mien.disk.files import write_atomically
 from mien.disk.limits import checked_whole
 from mien.disk.reading import open_archive, open_member, open_ordinary, parse_json
 from mien.errors import UserError
-from mien.formats.format import Content, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, SplatOptions, finite_arrays, gaussians_of, unit_quats
+from mien.formats.format import Content, SplatOptions, pose_words
+from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
 from mien.gaussians import Gaussians
 from mien.media.decoding import announced_size
 
@@ -68,7 +68,11 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
     if sh.shape[1] > 1:
         meta["shN"] = _add_palette(pictures, sh[:, 1:], width)
     members = {"meta.json": json.dumps(meta, allow_nan=False).encode(), **pictures}
-    write_atomically(path, lambda temporary: temporary.write_bytes(_zipped(members)))
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(zipfile.ZipInfo(name), data)
+    write_atomically(path, lambda temporary: temporary.write_bytes(file.getvalue()))
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -224,14 +228,6 @@ def _picture(values: np.ndarray, width: int) -> bytes:
     # Without `exact`, pixels with an alpha of 0 lose their colours. More effort takes ten times as long.
     picture = Image.fromarray(pixels.reshape(height, width, -1))
     picture.save(file, "WEBP", lossless=True, exact=True, quality=20, method=2)
-    return file.getvalue()
-
-
-def _zipped(members: dict[str, bytes]) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, data in members.items():
-            archive.writestr(zipfile.ZipInfo(name), data)
     return file.getvalue()
 
 

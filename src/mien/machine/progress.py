@@ -24,7 +24,6 @@ console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 """The console for people, on standard error, so that standard output stays for results."""
 
 _PLAIN_INTERVAL_SECONDS = 10.0
-_CALLS_BEFORE_ETA = 3
 _stage: list[str] = []
 """The name of the stage of the command that runs, if it has said so."""
 

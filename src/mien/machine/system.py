@@ -26,7 +26,6 @@ SIGNATURE_AT = 1 if IS_WINDOWS else 0
 
 PARENT_VARIABLE = "MIEN_VIEWER_OF"
 """Environment variable of a viewer with the process whose end also ends it."""
-_MIB = 1 << 20
 
 
 def is_locked(handle: int) -> bool:
@@ -95,13 +94,13 @@ def repeat_signal(thread: int, number: int) -> None:
 
 
 def peak_memory_mb() -> float:
-    """The most memory that this process has taken so far, in MiB."""
+    """The most memory that this process has taken so far, in MiB; 0 on Windows, where it is not asked for."""
     if sys.platform == "win32":
-        return _windows_peak() / _MIB
+        return 0.0
     import resource
 
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most / _MIB if sys.platform == "darwin" else most / 1024
+    return most / (1 << 20) if sys.platform == "darwin" else most / 1024
 
 
 def lower_priority(pid: int, steps: int) -> None:
@@ -129,24 +128,3 @@ def write_at(handle: int, data: "bytes | memoryview", offset: int) -> int:
         os.lseek(handle, offset, os.SEEK_SET)
         return os.write(handle, data)
     return os.pwrite(handle, data, offset)
-
-
-def _windows_peak() -> int:
-    """The peak of the working set in bytes; 0 if Windows does not tell it."""
-    if sys.platform != "win32":
-        raise AssertionError("only Windows asks for this")
-    import ctypes
-    from ctypes import wintypes
-
-    class Counters(ctypes.Structure):
-        _fields_ = (
-            ("size", wintypes.DWORD), ("faults", wintypes.DWORD), ("peak", ctypes.c_size_t),
-            *((f"unused{index}", ctypes.c_size_t) for index in range(7)),
-        )  # fmt: skip
-
-    counters = Counters(size=ctypes.sizeof(Counters))
-    ask = ctypes.windll.psapi.GetProcessMemoryInfo
-    ask.argtypes = [wintypes.HANDLE, ctypes.POINTER(Counters), wintypes.DWORD]
-    process = ctypes.windll.kernel32.GetCurrentProcess
-    process.restype = wintypes.HANDLE
-    return counters.peak if ask(process(), ctypes.byref(counters), counters.size) else 0

@@ -12,10 +12,8 @@ from torch import Tensor
 from mien.media.picture_files import encode_picture
 
 WHITE = 255
-Box = tuple[int, int, int, int]
-"""Left, top, width and height of a part of a picture, in pixels."""
 ERROR_LIMIT = 0.25
-"""Error, for colours in 0..1, that gets the brightest colour of `error_heat`."""
+"""Error, for colours in 0..1, that gets the brightest colour of `error_heat`. Pages say 64 of 255."""
 
 
 def to_uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -27,12 +25,6 @@ def heat_colors(values: Float[np.ndarray, "h w"], limit: float = 1.0) -> UInt8[n
     """Colours of `inferno`, from black over red to pale yellow, for values from 0 to `limit`. NaN is black."""
     levels = np.clip(np.nan_to_num(values) * (255 / limit), 0, 255).astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-
-
-def heat_gradient() -> str:
-    """The colours of `heat_colors` from 0 to its limit, as a CSS gradient from left to right."""
-    stops = heat_colors(np.linspace(0, 1, 6)[None])[0].tolist()
-    return f"linear-gradient(90deg,{', '.join(f'rgb{tuple(stop)}' for stop in stops)})"
 
 
 def error_heat(

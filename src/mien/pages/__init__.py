@@ -1,1 +1,1 @@
-"""Pages: `pages` fills the templates and names the figures, `plots` draws charts."""
+"""Pages: `pages` fills the templates, names the figures, and draws charts."""

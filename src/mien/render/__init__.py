@@ -1,6 +1,6 @@
 """Pictures of Gaussians and of meshes, with gradients, and camera paths."""
 
+from mien.gaussians import Rendering
 from mien.render.rasterize import rasterize
-from mien.render.rendering import Rendering
 
 __all__ = ["Rendering", "rasterize"]

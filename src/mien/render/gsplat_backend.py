@@ -10,9 +10,8 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.errors import UserError
-from mien.gaussians import Gaussians
+from mien.gaussians import Gaussians, Rendering
 from mien.render.projection import DILATION, MIN_ALPHA, NEAR
-from mien.render.rendering import Rendering
 from mien.render.validation import check_finite
 
 _TILE = 16

@@ -10,7 +10,7 @@ from itertools import product
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import grid_sample, normalize
 
 from mien import _native
 from mien.camera import Camera
@@ -110,6 +110,13 @@ def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"])
     both arguments.
     """
     return look_up_texture(texture, uv)
+
+
+def sample_picture(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:
+    """Values of a picture at points in -1..1."""
+    safe = grid.nan_to_num(2.0).clamp(-2, 2)[None, None]
+    values = grid_sample(picture.permute(2, 0, 1)[None], safe, mode=mode, padding_mode="border", align_corners=False)
+    return values[0, :, 0].T
 
 
 def vertex_normals(vertices: Float[Tensor, "*b v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "*b v 3"]:

@@ -10,9 +10,12 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.arrays import recycled, unpacked
-from mien.render.rendering import Rendering, View
+from mien.camera import Camera
+from mien.gaussians import Gaussians, Rendering
 from mien.render.validation import TooManyPairsError, check_finite
 
+View = tuple[Gaussians, Camera]
+"""Unbatched Gaussians in the camera's world, and the camera."""
 _TOO_MANY_PAIRS = "too many pairs"
 """Start of the native core's message for this error (`native/rasterize_bin.cpp`)."""
 _INPUTS = 9

@@ -9,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.gaussians import Gaussians, sh_from_rgb
+from mien.gaussians import Gaussians, Rendering, sh_from_rgb
 from mien.render.gsplat_backend import render_gsplat
-from mien.render.native import render_native
+from mien.render.native import View, render_native
 from mien.render.reference import render_reference
-from mien.render.rendering import Rendering, View
 from mien.render.validation import check_shapes
 from mien.rotation import compose_rigid
 

@@ -5,9 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.gaussians import Gaussians
+from mien.gaussians import Gaussians, Rendering
 from mien.render.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, Splats, project_splats
-from mien.render.rendering import Rendering
 from mien.render.validation import check_finite
 
 _TILE = 32

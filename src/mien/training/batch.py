@@ -24,9 +24,9 @@ from mien.avatar.avatar import ParameterGroup, Posed
 from mien.avatar.settings import PerceptualLoss, Progress
 from mien.camera import Camera
 from mien.face.params import concatenate
+from mien.gaussians import Rendering
 from mien.render import rasterize
 from mien.render.rasterize import rasterize_each
-from mien.render.rendering import Rendering
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import CROP, LEAST_EXTENT, BatchFrame, Frame, FrameOrder, background_at, random_at
 from mien.training.footage.sequence import Target, Targets

@@ -24,7 +24,7 @@ from mien.avatar.settings import Rate
 from mien.capture.quality import is_light_changing
 from mien.disk.files import expect_whole, read_tensors
 from mien.errors import UserError
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import TrainSettings

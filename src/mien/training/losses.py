@@ -17,9 +17,9 @@ from torch.nn.functional import conv2d
 from mien import _native
 from mien.arrays import is_native, native, recycled, unpacked
 from mien.avatar.settings import PerceptualLoss, Photometric
-from mien.media.pictures import Box
+from mien.camera import Box
+from mien.gaussians import Rendering
 from mien.perceptual.features import TrainingFeatures, load_training_features
-from mien.render.rendering import Rendering
 from mien.training.footage.sequence import Target
 
 WINDOW_RADIUS = 5

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from collections.abc import Sequence as Items
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -28,14 +28,16 @@ from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.runtime.baked import Filmed
-from mien.tracking.tracking import Tracking
 from mien.training.checkpoint import CURVES, TrainingState
 from mien.training.colors import GAINS
 from mien.training.footage.coverage import Coverage
 from mien.training.footage.filmed import write_coverage
 from mien.training.footage.sequence import Sequence
 from mien.training.settings import PRESETS, TrainSettings
+
+if TYPE_CHECKING:
+    from mien.runtime.baked import Filmed
+    from mien.tracking.tracking import Tracking
 
 _FORMAT, _VERSION = "mien.run", 1
 _SUMMARY = "mien.training"
@@ -106,7 +108,7 @@ def is_part_of(sequence: str, name: str) -> bool:
     return sequence == name or re.fullmatch(re.escape(name) + r"-\d+", sequence) is not None
 
 
-def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
+def check_data(run_dir: Path, trackings: "Mapping[str, Tracking]") -> None:
     """Check that sequences were not tracked again since a run was trained on them."""
     outdated = outdated_sequences(run_dir, trackings)
     if outdated:
@@ -116,7 +118,7 @@ def check_data(run_dir: Path, trackings: Mapping[str, Tracking]) -> None:
         )
 
 
-def outdated_sequences(run_dir: Path, trackings: Mapping[str, Tracking]) -> list[str]:
+def outdated_sequences(run_dir: Path, trackings: "Mapping[str, Tracking]") -> list[str]:
     """Names of the sequences among `trackings` (by name) whose tracking is not the one that the run was trained on."""
     data = read_run_config(run_dir)["data"]
     known = [entry for entry in data if entry["sequence"] in trackings]
@@ -152,7 +154,7 @@ def read_face_track(run_dir: Path, face_model: FaceModel) -> FaceParams:
     return face
 
 
-def filmed_range(run_dir: Path, avatar: Avatar) -> Filmed:
+def filmed_range(run_dir: Path, avatar: Avatar) -> "Filmed":
     """What training saw of the face. If an avatar does not say: all timesteps of the run, seen by its first camera."""
     if avatar.filmed is not None:
         return avatar.filmed
@@ -249,7 +251,7 @@ def _camera_entry(camera: Camera) -> dict[str, Any]:
     return {"K": K, "viewmat": viewmat, "width": camera.width, "height": camera.height}
 
 
-def _tracking_digest(tracking: Tracking) -> str:
+def _tracking_digest(tracking: "Tracking") -> str:
     digest = hashlib.sha256()
     for name, tensor in sorted(tracking.face.tensors().items()):
         digest.update(name.encode() + tensor.detach().numpy().tobytes())

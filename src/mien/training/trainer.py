@@ -22,12 +22,12 @@ from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
+from mien.gaussians import Rendering
 from mien.machine.devices import choose_device, like_on
 from mien.machine.progress import Advance, progress_bar
 from mien.machine.stops import stops_put_off
 from mien.machine.threads import one_torch_thread
 from mien.perceptual.features import load_training_features
-from mien.render.rendering import Rendering
 from mien.render.validation import CannotDrawError
 from mien.training.adam import Adam
 from mien.training.batch import (

@@ -7,14 +7,13 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from mien import runtime
 from mien.errors import UserError
-from mien.formats.shared.packed import Motion
 from mien.runtime.filmed import within_filmed_inputs
 from mien.runtime.posing import Face
 from mien.viewer.drawing import (
@@ -33,6 +32,9 @@ from mien.viewer.drawing import (
 )
 from mien.viewer.faces import random_expression
 
+if TYPE_CHECKING:
+    from mien.formats.shared.packed import Motion
+
 DEFAULT_HEIGHT = 512
 """Largest height of a picture in pixels, at first."""
 
@@ -41,7 +43,7 @@ DEFAULT_HEIGHT = 512
 class Clip:
     """A motion that the avatar can play."""
 
-    motion: Motion
+    motion: "Motion"
     pictures: Callable[[int], UInt8[np.ndarray, "_ _ 3"]] | None = None
     """Returns the filmed frame at a timestep. None if there are none."""
 

@@ -24,8 +24,7 @@ from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.gaussians import stack_timesteps
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering, stack_timesteps
 from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound
 
 _RATES = {

@@ -48,8 +48,7 @@ from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
-from mien.gaussians import Gaussians
-from mien.render.rendering import Rendering
+from mien.gaussians import Gaussians, Rendering
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
 
 _OPACITY_RATE = Rate(0.05)  # of opacities that Gaussians have themselves. Of 3D Gaussian Splatting

@@ -12,7 +12,7 @@ from mien.avatar.settings import (
     Rate,
     free_points_paper,
 )
-from mien.disk.config import Above, Range
+from mien.disk.config import NotBelow, Range
 
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
@@ -31,7 +31,7 @@ class MonoGaussianAvatarConfig(FreePointsConfig):
     """Losses of pictures. The weights of L1 and 1 - SSIM are the paper's."""
     points_per_step: Annotated[int, Range(1, 100_000_000)] = 102_400
     """Largest number of points, summed over the frames of an optimiser step."""
-    epochs: Annotated[int, Range(1, 100_000), Above("first_epoch")] = 115
+    epochs: Annotated[int, Range(1, 100_000), NotBelow("first_epoch", above=True)] = 115
     """The paper's epoch with which the run ends. After each epoch, points are pruned and refilled; number of points,
     radii and the weight of the face model's terms follow the epochs."""
     first_epoch: Annotated[int, Range(0, 100_000)] = 60

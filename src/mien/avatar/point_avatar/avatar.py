@@ -42,8 +42,7 @@ from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
-from mien.gaussians import Gaussians, sh_from_rgb
-from mien.render.rendering import Rendering
+from mien.gaussians import Gaussians, Rendering, sh_from_rgb
 from mien.runtime.baked import Attributes, BlendSkinned
 
 _OPACITY = 0.99

@@ -37,9 +37,8 @@ from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
-from mien.gaussians import sh_from_rgb
+from mien.gaussians import Rendering, sh_from_rgb
 from mien.render.mesh import shade, vertex_normals
-from mien.render.rendering import Rendering
 from mien.runtime.baked import Attributes, MeshBound
 
 _OPACITY = 0.99

@@ -3,22 +3,25 @@
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from mien.camera import Camera
 from mien.datasets.flame_poses import AXES, face_of_flame, in_front
 from mien.datasets.layouts.layout import MatteKind
 from mien.face.model import FaceModel
+from mien.face.models.flame_params import flame_params_of
 from mien.face.params import FaceParams
-from mien.formats.shared.flame_params import flame_params_of
 from mien.rotation import matrix_from_axis_angle
 from mien.training.footage.foreground import foreground_colors
 from mien.training.footage.frames import held_out_of, training_frames
 from mien.training.footage.sequence import Sequence, composite
-from mien.training.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from mien.camera import Camera
+    from mien.training.settings import TrainSettings
 
 _WHITE = np.full(3, 255, np.uint8)
 
@@ -48,7 +51,7 @@ class Filmed:
         return self.sequence.capture.width, self.sequence.capture.height
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> "Camera":
         """The first camera."""
         return self.sequence.tracking.cameras[0]
 
@@ -97,7 +100,7 @@ class Filmed:
         return poses
 
 
-def filmed_frames(sequence: Sequence, face_model: FaceModel, settings: TrainSettings, mattes: MatteKind) -> Filmed:
+def filmed_frames(sequence: Sequence, face_model: FaceModel, settings: "TrainSettings", mattes: MatteKind) -> Filmed:
     """Return the frames of a sequence that mien trains on, and those that it holds out. Others are left out."""
     trained = {frame.timestep for frame in training_frames([sequence], settings)}
     left_out = held_out_of(sequence, settings.split).numpy()

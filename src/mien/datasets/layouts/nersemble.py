@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from mien.datasets.layouts.filmed import Filmed, as_flame, lost_words
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
+from mien.datasets.nersemble import CALIBRATION
 from mien.datasets.nersemble_benchmark import TEST_ENDING, TRACKING
 from mien.machine.progress import say
 from mien.media.video_file import create_video
@@ -30,7 +31,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
     capture = filmed.sequence.capture
     cameras = dict(zip(capture.camera_ids, filmed.sequence.tracking.cameras, strict=True))
     write_plain_json(
-        folder / "calibration" / "camera_params.json",
+        folder / CALIBRATION,
         {
             "world_2_cam": {name: camera.viewmat.double().tolist() for name, camera in cameras.items()},
             "intrinsics": {name: camera.K.double().tolist() for name, camera in cameras.items()},
@@ -93,20 +94,15 @@ def _flame(folder: Path, filmed: Filmed) -> tuple[dict[str, np.ndarray], tuple[s
     if whole["static_offset"].any():
         told.append("Lost: the offsets of the mesh.")
     told += [*lost_words("identity", whole["shape"], _SHAPES), *lost_words("expression", whole["expr"], _EXPRESSIONS)]
+    # Angles in radians whose rotations Rx Ry Rz are the turns.
+    x, z = np.arctan2(-turns[:, 1, 2], turns[:, 2, 2]), np.arctan2(-turns[:, 0, 1], turns[:, 0, 0])
+    angles = np.stack([x, np.arcsin(np.clip(turns[:, 0, 2], -1, 1)), z], axis=1)
     written = {
-        "shape": arrays["shape"][None], "expression": arrays["expr"], "rotation": euler_xyz_of(turns),
+        "shape": arrays["shape"][None], "expression": arrays["expr"], "rotation": angles,
         "rotation_matrices": turns, "translation": shifts, "scale": np.ones((1, 1)), "jaw": arrays["jaw_pose"],
         "neck": arrays["neck_pose"], "eyes": arrays["eyes_pose"],
     }  # fmt: skip
     return written, tuple(told)
-
-
-def euler_xyz_of(turns: np.ndarray) -> np.ndarray:
-    """Angles [t, 3] in radians with Rx Ry Rz the rotations [t, 3, 3]."""
-    y = np.arcsin(np.clip(turns[:, 0, 2], -1, 1))
-    x = np.arctan2(-turns[:, 1, 2], turns[:, 2, 2])
-    z = np.arctan2(-turns[:, 0, 1], turns[:, 0, 0])
-    return np.stack([x, y, z], axis=1)
 
 
 def _write_video(path: Path, pictures: Iterator[UInt8[np.ndarray, "h w 3"]], fps: float) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mien.camera import Box
 from mien.datasets.layouts.filmed import Filmed
 from mien.datasets.layouts.layout import Layout, Written, check_new_folder
 from mien.disk.files import cannot_write, replace_folder
@@ -14,7 +15,6 @@ from mien.errors import UserError
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
 from mien.machine.terminal import counted
 from mien.media.picture_files import write_png
-from mien.media.pictures import Box
 from mien.tracking.scoring import head_crop
 
 README = "README.txt"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -16,14 +17,19 @@ _MAX_NUMBER = 1e6  # bound of all numbers in a file: metres, weights and indices
 
 
 def check_arrays(
-    path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, str], missing: str, remedy: str
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    shapes: Mapping[str, str],
+    missing: str,
+    remedy: str,
+    known: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, int]:
     """Check shapes and numbers of arrays, and return the sizes that the letters stand for.
 
-    `shapes` are such as "v 3": a letter is the same size wherever it stands. `missing` is said of an array that is
-    missing.
+    `shapes` are such as "v 3": a letter is the same size wherever it stands, also in the `known` sizes. `missing` is
+    said of an array that is missing.
     """
-    sizes: dict[str, int] = {}
+    sizes = dict(known)
     for key in shapes:
         if key not in arrays:
             raise UserError(f"{path}: has no {key!r}, so {missing}")
@@ -33,26 +39,24 @@ def check_arrays(
         for size, symbol in zip(array.shape, symbols, strict=False):
             fits = fits and size > 0 and size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size))
         if not fits:
-            known = " ".join(str(sizes.get(symbol, symbol)) for symbol in symbols)
+            wanted = " ".join(str(sizes.get(symbol, symbol)) for symbol in symbols)
             raise UserError(
-                f"{path}: {key!r} is {array.dtype} [{' '.join(map(str, array.shape))}], but should be numbers "
-                f"[{known}]; {remedy}"
+                f"{path}: {key!r} has the shape {list(array.shape)} of {array.dtype}, not numbers in [{wanted}]; "
+                f"{remedy}"
             )
-        check_numbers(path, key, array)
+        check_numbers(path, key, array, remedy)
     return sizes
 
 
-def check_numbers(path: Path, key: str, array: np.ndarray) -> None:
+def check_numbers(path: Path, key: str, array: np.ndarray, remedy: str = "download it again") -> None:
     """Check that the numbers of an array are finite and moderate."""
     if array.dtype.kind != "f":
         return
     if not np.isfinite(array).all():
-        raise UserError(f"{path}: {key!r} holds numbers that are not finite; download it again")
+        raise UserError(f"{path}: {key!r} holds numbers that are not finite; {remedy}")
     largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
     if largest > _MAX_NUMBER:
-        raise UserError(
-            f"{path}: {key!r} holds {largest:g}, but a head has no number above {_MAX_NUMBER:g}; download it again"
-        )
+        raise UserError(f"{path}: {key!r} holds {largest:g}, but a head has no number above {_MAX_NUMBER:g}; {remedy}")
 
 
 def check_indices(path: Path, key: str, values: np.ndarray, count: int) -> np.ndarray:

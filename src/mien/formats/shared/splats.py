@@ -1,7 +1,6 @@
-"""What the files of Gaussians in a pose share: options, checked arrays and unit rotations. Torch is needed to read."""
+"""What the files of Gaussians in a pose share: checked arrays and unit rotations. Torch is needed to read."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.errors import UserError
-from mien.formats.format import Content, PoseOptions
 
 if TYPE_CHECKING:
     import mien.gaussians
@@ -17,20 +15,6 @@ if TYPE_CHECKING:
 MAX_GAUSSIANS = 2_000_000
 """Largest number of Gaussians that is read: a head has tens of thousands, and memory grows with it."""
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
-
-
-@dataclass(frozen=True)
-class SplatOptions(PoseOptions):
-    """Options of files whose usual viewers take +y for down."""
-
-    y_down: bool = False
-    """Turn the head by half a turn about x, for viewers that take +y for down and would show it upside down."""
-
-    def pose(self, content: Content) -> "mien.gaussians.Gaussians":
-        """Return the Gaussians as they are written."""
-        from mien.formats.shared.world_space import with_y_down
-
-        return with_y_down(content.pose()) if self.y_down else content.pose()
 
 
 def finite_arrays(path: Path, gaussians: "mien.gaussians.Gaussians") -> tuple[np.ndarray, ...]:

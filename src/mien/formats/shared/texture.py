@@ -12,9 +12,8 @@ from torch import Tensor
 from mien import runtime
 from mien.camera import Camera, camera_from_fov
 from mien.render.camera_paths import turned_camera
-from mien.render.mesh import interpolate, rasterize_mesh, vertex_normals
+from mien.render.mesh import interpolate, rasterize_mesh, sample_picture, vertex_normals
 from mien.runtime.posing import SH_C0
-from mien.training.footage.mesh_colors import sample_picture
 
 VIEWS = tuple((yaw, 0) for yaw in range(0, 360, 30)) + tuple(
     (yaw, pitch) for pitch in (-40, 40) for yaw in range(0, 360, 60)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
+from mien.camera import Box
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -23,8 +24,8 @@ from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.machine.terminal import counted
-from mien.media.pictures import Box, side_by_side, to_uint8
-from mien.pages.plots import Axes, Series
+from mien.media.pictures import side_by_side, to_uint8
+from mien.pages.pages import Axes, Series
 from mien.render import rasterize
 from mien.training.footage.frames import Frame, spread_frames
 

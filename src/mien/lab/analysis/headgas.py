@@ -37,7 +37,7 @@ from mien.machine.progress import track_progress
 from mien.machine.terminal import counted
 from mien.media.pictures import picture_grid, side_by_side
 from mien.media.video import write_video
-from mien.pages.plots import Axes, Series
+from mien.pages.pages import Axes, Series
 from mien.render.camera_paths import turned_camera
 from mien.runtime.filmed import head_angles
 

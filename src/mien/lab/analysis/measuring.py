@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mien import _native
 from mien.avatar.avatar import Avatar
-from mien.camera import Camera
+from mien.camera import Box, Camera
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -24,7 +24,7 @@ from mien.face.params import FaceParams
 from mien.lab.analysis.running import Run
 from mien.machine.system import peak_memory_mb
 from mien.machine.threads import one_torch_thread
-from mien.media.pictures import WHITE, Box, to_uint8
+from mien.media.pictures import WHITE, to_uint8
 from mien.perceptual.distance import PerceptualDistance, load_perceptual
 from mien.render import rasterize
 from mien.render.mesh import Headlight, render_mesh

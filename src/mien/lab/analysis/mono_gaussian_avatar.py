@@ -31,7 +31,7 @@ from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.terminal import counted
 from mien.media.pictures import side_by_side
-from mien.pages.plots import Axes, Series
+from mien.pages.pages import Axes, Series
 from mien.perceptual.distance import PerceptualDistance
 from mien.render import rasterize
 from mien.runtime.filmed import head_angles

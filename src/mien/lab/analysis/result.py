@@ -18,8 +18,7 @@ from mien.evaluation.page_parts import Card, Cell, DataTable, video_of
 from mien.evaluation.page_parts import Picture as PagePicture
 from mien.media.picture_files import write_png
 from mien.media.pictures import data_uri
-from mien.pages.pages import render
-from mien.pages.plots import Axes, Series, line_chart, thin, write_chart
+from mien.pages.pages import Axes, Series, line_chart, render, thin, write_chart
 
 
 @dataclass(frozen=True)

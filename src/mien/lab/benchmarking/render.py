@@ -14,7 +14,7 @@ from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, rows_by_threads, time_function
 from mien.machine.terminal import counted
-from mien.pages.plots import Axes, Series, write_chart
+from mien.pages.pages import Axes, Series, write_chart
 from mien.render import rasterize
 
 COUNTS = (10_000, 30_000, 100_000, 300_000)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mien.camera import Camera
+from mien.camera import Box, Camera
 from mien.capture.capture import Capture
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
@@ -20,8 +20,7 @@ from mien.lab.synthetic.recipe import SIDES
 from mien.lab.synthetic.truth import Truth
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
-from mien.media.pictures import Box
-from mien.pages.plots import Axes, Series, write_chart
+from mien.pages.pages import Axes, Series, write_chart
 from mien.render import rasterize
 from mien.render.mesh import render_mesh
 from mien.tracking.neck_cut import NeckParts

@@ -11,8 +11,7 @@ from mien.capture.capture import Capture
 from mien.disk.files import write_atomically, write_json
 from mien.face.model import FaceModel
 from mien.media.pictures import picture_uri, shrink
-from mien.pages.pages import render
-from mien.pages.plots import Axes, Series, line_chart
+from mien.pages.pages import Axes, Series, line_chart, render
 from mien.tracking.report.contact_sheet import SheetFrame, name_of, sheet_frames, tiles_of
 from mien.tracking.report.overlay import HOTTEST, OverlayPainter, frontal_camera
 from mien.tracking.report.residuals import (

@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from mien.capture.capture import Capture
 from mien.disk.files import write_atomically
 from mien.face.model import FaceModel
-from mien.pages.pages import render
-from mien.pages.plots import Axes, Series, line_chart
+from mien.pages.pages import Axes, Series, line_chart, render
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.sequence import SequenceData
 from mien.tracking.landmarks.outcome import as_tracking

@@ -36,7 +36,7 @@ from mien.avatar.avatar import Posed
 from mien.avatar.density import GradientDensity
 from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 
 PRUNE_OPACITY = 0.005  # opacity below which Gaussians are removed. Of 3D Gaussian Splatting

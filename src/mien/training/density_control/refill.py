@@ -22,7 +22,7 @@ from mien.avatar.avatar import Posed
 from mien.avatar.density import RefillDensity
 from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from mien.avatar.avatar import Posed
 from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 
 Random = Callable[[], torch.Generator]
 """Creates the generator for a step's random numbers. Few steps need one."""

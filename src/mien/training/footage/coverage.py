@@ -14,11 +14,11 @@ from torch.nn.functional import normalize
 
 from mien.face.model import FaceModel
 from mien.machine.parallel import stream_in_threads
-from mien.render.mesh import rasterize_mesh
+from mien.render.mesh import rasterize_mesh, sample_picture
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.training.footage.frames import Footage, Frame, spread_frames
-from mien.training.footage.mesh_colors import DEPTH_TOLERANCE, sample_picture
+from mien.training.footage.mesh_colors import DEPTH_TOLERANCE
 
 _COVERAGE_EVEN_FRAMES = 48  # number of evenly spread frames in which coverage is measured
 _COVERAGE_TURNED_FRAMES = 24  # number of other frames: those in which the head turns furthest to each side

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,8 +16,10 @@ from mien.disk.files import expect_whole, read_tensors, write_tensors
 from mien.face.model import FaceModel
 from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
-from mien.runtime.baked import Filmed
 from mien.training.footage.coverage import Coverage
+
+if TYPE_CHECKING:
+    from mien.runtime.baked import Filmed
 
 _FILMED_CONFIDENCE = 0.85  # mean confidence of the visible surface from which a view counts as filmed. Set by eye
 _SHOWN_CONFIDENCE = 0.5  # the same from which the head of a filled avatar may turn there. Set by eye (log, 11-23)
@@ -72,8 +75,8 @@ def filmed_yaws(face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage:
 
 
 def with_shown_angles(
-    filmed: Filmed, face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage: Coverage
-) -> Filmed:
+    filmed: "Filmed", face_model: FaceModel, vertices: Float[Tensor, "v 3"], coverage: Coverage
+) -> "Filmed":
     """`filmed` with head angles that also have the views of which at least half was filmed.
 
     It is for avatars whose other half is filled. What moves the head keeps softly to these angles (`keep_to_filmed`).

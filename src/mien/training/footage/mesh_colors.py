@@ -4,10 +4,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import normalize
 
 from mien.machine.parallel import stream_in_threads
-from mien.render.mesh import rasterize_mesh, vertex_normals
+from mien.render.mesh import rasterize_mesh, sample_picture, vertex_normals
 from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.sequence import composite
 
@@ -58,13 +58,6 @@ def _seen_colors(footage: Footage, frame: Frame) -> tuple[Float[Tensor, "v 3"], 
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
     seen = inside & (depth < front + DEPTH_TOLERANCE) & (alpha[:, 0] > 0.9)
     return colors, torch.where(seen, facing**2, torch.zeros_like(facing))
-
-
-def sample_picture(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:
-    """Values of a picture at points in -1..1."""
-    safe = grid.nan_to_num(2.0).clamp(-2, 2)[None, None]
-    values = grid_sample(picture.permute(2, 0, 1)[None], safe, mode=mode, padding_mode="border", align_corners=False)
-    return values[0, :, 0].T
 
 
 def _spread(colors: Float[Tensor, "v 3"], known: Tensor, faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:

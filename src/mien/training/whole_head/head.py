@@ -16,7 +16,7 @@ from mien.avatar.density import DensityControl
 from mien.avatar.settings import Photometric, Progress
 from mien.camera import Camera
 from mien.face.params import FaceParams
-from mien.render.rendering import Rendering
+from mien.gaussians import Rendering
 from mien.training.footage.coverage import Coverage, measure_coverage
 from mien.training.footage.filmed import with_shown_angles
 from mien.training.footage.frames import COVER, SIDE_VIEW, BatchFrame, Footage, random_at

@@ -1,6 +1,7 @@
 """A soft cut: opacity fades towards the neck cut, so that a head that is shown ends softly and not in frayed ends."""
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -9,9 +10,11 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.gaussians import world_means
-from mien.runtime.baked import PortableAvatar
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.training.footage.coverage import smoothstep
+
+if TYPE_CHECKING:
+    from mien.runtime.baked import PortableAvatar
 
 SOFT_CUT_WIDTH = 0.03
 """Distance from the neck cut over which opacity fades where a head is shown, in metres. 2 to 4 cm were looked at on
@@ -35,7 +38,7 @@ _PART = 4096
 
 
 @torch.no_grad()
-def with_soft_cut(portable: PortableAvatar, avatar: Avatar) -> PortableAvatar:
+def with_soft_cut(portable: "PortableAvatar", avatar: Avatar) -> "PortableAvatar":
     """The record of an avatar whose opacity fades towards the neck cut.
 
     Training and scoring cut heads off sharply, because their truth is cut off sharply. What is shown need not be. The

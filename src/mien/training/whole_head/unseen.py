@@ -21,9 +21,9 @@ from mien.avatar.density import DensityControl, GradientDensity
 from mien.avatar.settings import Photometric
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
+from mien.gaussians import Rendering
 from mien.machine.parallel import stream_in_threads
 from mien.render.mesh import rasterize_mesh, vertex_normals
-from mien.render.rendering import Rendering
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
 from mien.training.footage.frames import Footage, Frame, spread_frames
 from mien.training.footage.hidden import hidden_triangles

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mien.camera import Box
 from mien.disk.files import file_digest, write_atomically
 from mien.disk.locks import hold
 from mien.errors import UserError
@@ -27,7 +28,7 @@ from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
 from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, StudySettings, key_path, write_key
 from mien.machine.progress import progress_bar, say
-from mien.media.pictures import WHITE, Box, to_uint8
+from mien.media.pictures import WHITE, to_uint8
 from mien.media.video import write_video
 from mien.training.footage.frames import Frame
 
