@@ -57,8 +57,6 @@ a false face, for example in hair seen from behind."""
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One camera, its video, and what is known of its pictures."""
-
     camera_id: str
     job: CaptureJob
     survey: Survey
@@ -180,7 +178,6 @@ def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, 
 
 
 def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
-    """Find the faces in all videos."""
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
         given = job.given()

@@ -110,13 +110,11 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
     check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
     with cleaning_up(out, scratch) as survey_folder:
-        given = job.given()
-        survey, given = _run_survey(job, survey_folder, given)
+        survey, given = _run_survey(job, survey_folder)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
-        key = _part_key(job, 1, 1)
-        draft = _draft(job, enumerate(job.frames.frames()), part, key, given, out)
+        draft = _draft(job, enumerate(job.frames.frames()), part, (1, 1), given, out)
         if draft is not None:
-            _finish(job, draft, key, (1, 1), given, out)
+            _finish(job, draft, (1, 1), given, out)
     return read_capture(out)
 
 
@@ -141,8 +139,7 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
     for first in (job.name, f"{job.name}-1"):
         check_place(_capture_dir(sequences, first), job)
     with cleaning_up(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
-        given = job.given()
-        survey, given = _run_survey(job, survey_folder, given)
+        survey, given = _run_survey(job, survey_folder)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
             for part in parts:
@@ -157,7 +154,7 @@ def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], giv
     stream, drafts = enumerate(job.frames.frames()), []
     for number, part in enumerate(parts, 1):
         out = _capture_dir(sequences, part.name)
-        drafts.append(_draft(job, stream, part, _part_key(job, number, len(parts)), given, out))
+        drafts.append(_draft(job, stream, part, (number, len(parts)), given, out))
     unfinished = [draft for draft in drafts if draft is not None]
     if len(unfinished) == len(parts) and job.settings.person:
         # Parts that are finished were compared by the call that was interrupted.
@@ -171,7 +168,7 @@ def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], giv
         if draft is not None:
             place, out = (number, len(parts)), _capture_dir(sequences, part.name)
             out.parent.mkdir(exist_ok=True)
-            _finish(job, replace(draft, part=part), _part_key(job, *place), place, given, out)
+            _finish(job, replace(draft, part=part), place, given, out)
     _discard(unfinished)
     return parts
 
@@ -326,8 +323,8 @@ def prepare(work: Path, key: str) -> Path:
     return work
 
 
-def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Survey, GivenInputs]:
-    """Return the survey, and what is given with the alpha of the source."""
+def _run_survey(job: CaptureJob, folder: Path) -> tuple[Survey, GivenInputs]:
+    given = job.given()
     tell_kind(job.frames)
     survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks, job.detector)
     given = with_own_alpha(given, job.frames, survey.transparent)
@@ -339,8 +336,11 @@ def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Surv
     return survey, given
 
 
-def _draft(job: CaptureJob, stream: Stream, part: Part, key: str, given: GivenInputs, out: Path) -> Draft | None:
+def _draft(
+    job: CaptureJob, stream: Stream, part: Part, place: tuple[int, int], given: GivenInputs, out: Path
+) -> Draft | None:
     """Write the frames and mattes of a part beside `out`, or return None if the part is finished."""
+    key = _part_key(job, *place)
     if read_finished(out, key) is not None:
         return None
     work = prepare(partial_folder(out), key)
@@ -349,7 +349,7 @@ def _draft(job: CaptureJob, stream: Stream, part: Part, key: str, given: GivenIn
     return Draft(part, layout, process_part(stream, part, given, layout, work / _CHUNKS, detector=job.detector))
 
 
-def _finish(job: CaptureJob, draft: Draft, key: str, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
+def _finish(job: CaptureJob, draft: Draft, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
     part, survey = draft.part, draft.part.survey
     landmarks = join_chunks([draft.chunks], "landmarks")
     missed = int(np.isnan(landmarks[:, 0, 0, 0]).sum())
@@ -370,7 +370,7 @@ def _finish(job: CaptureJob, draft: Draft, key: str, place: tuple[int, int], giv
     if missed:
         say(f"{part.name}: no face in {missed} of {len(landmarks)} frames; they are left out")
     source = {
-        "key": key,
+        "key": _part_key(job, *place),
         "file": job.frames.path.name,
         "content_hash": job.frames.content_hash,
         **origin_of(part),

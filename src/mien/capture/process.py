@@ -74,25 +74,19 @@ class LandmarkFollower:
 
     def find(self, timestep: int, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 2"] | None:
         """Return the person's landmarks in the next picture, in pixels, or None if the face is not found."""
-        faces = self._detector.detect(image)
-        expected = self._expected(timestep)
-        if expected is None:
+        faces, chosen = self._detector.detect(image), None
+        # The box where the face should be: the survey's, or else that of the last landmarks if they are recent.
+        if np.isfinite(self._boxes[timestep, 0]):
+            chosen = self._nearest(faces, self._boxes[timestep], self._others[timestep])
+        elif self._last is not None and abs(timestep - self._last[0]) <= _FACE_MOST_AGE:
+            chosen = self._nearest(faces, _box(self._last[1]), self._others[timestep])
+        elif self._is_alone and len(faces):
             # The two detectors differ. If the clip never shows anybody else, any face that is detected here is the
             # person.
-            chosen = faces[0] if self._is_alone and len(faces) else None
-        else:
-            chosen = self._nearest(faces, expected, self._others[timestep])
+            chosen = faces[0]
         if chosen is not None:
             self._last = timestep, chosen
         return chosen
-
-    def _expected(self, timestep: int) -> Float[np.ndarray, " 4"] | None:
-        """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
-        if np.isfinite(self._boxes[timestep, 0]):
-            return self._boxes[timestep]
-        if self._last is None or abs(timestep - self._last[0]) > _FACE_MOST_AGE:
-            return None
-        return _box(self._last[1])
 
     @staticmethod
     def _nearest(faces: np.ndarray, expected: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "l 2"] | None:
@@ -192,7 +186,6 @@ class PartProcessor:
 
 
 def _read(path: Path) -> Chunk:
-    """Read a chunk that an interrupted call saved."""
     arrays = read_arrays(path)
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         return Chunk(**arrays)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
-from mien.face.parts import PARTS
+from mien.face.head_parts import PARTS
 from mien.machine.threads import asked_threads
 from mien.media.pictures import Box, to_uint8
 from mien.pages.pages import METRICS

@@ -87,8 +87,6 @@ def deinterlace(frames: Iterable[av.VideoFrame], order: FieldOrder, mode: Deinte
 
 
 class _Graph:
-    """FFmpeg's filter for frames of one size and format."""
-
     def __init__(self, first: av.VideoFrame, order: FieldOrder, mode: Deinterlace) -> None:
         self._kind = _kind(first)
         self._takes_all = mode == "always" or order.is_interlaced
@@ -112,7 +110,6 @@ class _Graph:
         yield from self._pull()
 
     def finish(self) -> Iterator[FieldFrame]:
-        """Yield the frames that are left."""
         self._graph.vpush(None)
         yield from self._pull()
         assert not self._waiting, len(self._waiting)

