@@ -57,10 +57,7 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     cuts = find_cuts(survey.thumbnails, survey.boxes) if settings.cuts else []
     if cuts:
         say(f"warning: {path}: the video cuts to another shot at {_list_times(survey, cuts)}; tracking may fail there")
-    part = _make_part(survey, 0, settings, name)
-    if part is None:
-        raise no_face(path, len(survey.timestamps))
-    _tell_people(path, part)
+    (part,) = find_parts(survey, replace(settings, cuts=False), path, name)
     return part
 
 

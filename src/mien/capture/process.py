@@ -22,10 +22,10 @@ from mien.capture.person.given import GivenInputs
 from mien.capture.person.matte import MakeMatte, choose_matting, held, without_others
 from mien.capture.person.people import Person
 from mien.capture.person.plate import screen_of, without_screen
-from mien.capture.person.survey import Survey
+from mien.capture.person.survey import Survey, read_saved
 from mien.capture.quality import MEASURES, FrameQuality, measure_face, quality_report, relative_quality
 from mien.capture.store import finish_capture
-from mien.disk.files import expect_whole, read_arrays, write_arrays
+from mien.disk.files import write_arrays
 from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
@@ -185,12 +185,6 @@ class PartProcessor:
         return frame.number, self._part.crop.apply(brought_to(frame.picture(), (width, height)))
 
 
-def _read(path: Path) -> Chunk:
-    arrays = read_arrays(path)
-    with expect_whole(path, "delete its folder and run `mien capture` again"):
-        return Chunk(**arrays)
-
-
 def process_part(
     stream: Stream,
     part: Part,
@@ -203,7 +197,7 @@ def process_part(
     """Process a part as one camera of the layout. Chunks that an interrupted call left in `work` are kept."""
     work.mkdir(exist_ok=True)
     paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, CHUNK)}
-    chunks = [_read(path) for path in itertools.takewhile(Path.exists, paths.values())]
+    chunks = [read_saved(path, Chunk) for path in itertools.takewhile(Path.exists, paths.values())]
     done = sum(len(chunk.landmarks) for chunk in chunks)
     if done == layout.timesteps:
         return chunks

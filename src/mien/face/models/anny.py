@@ -5,6 +5,7 @@ people. This file repairs the mesh at collar, mouth and lids, where it does not 
 builds expressions and joints.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,9 @@ _ANNY_TONGUE_BACK = 0.003  # distance in metres by which the tongue moves back a
 _ANNY_COLLAR_STEPS = 24
 """Smoothing steps along the jagged edge of the cut over the shoulders. Set by eye (log, "Recipe 5")."""
 _ANNY_COLLAR_RINGS = 5  # number of vertex rings above this edge that follow it. Set by eye
+
+
+_rounded = partial(rounded, quantum=QUANTUM)
 
 
 def bake_anny() -> FaceModel:
@@ -111,10 +115,6 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
     )
 
 
-def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
-    return rounded(values, QUANTUM)
-
-
 def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
     """Weight of each vertex in the principal components: high where cameras see a face most."""
     weights = np.where(topology.parts["head"], 1.0, 0.2)
@@ -166,7 +166,8 @@ def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"
 
     The change is linear, so identity stays linear.
     """
-    edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
     move = np.linalg.matrix_power(step, _ANNY_COLLAR_STEPS) - np.eye(len(loop))
@@ -184,10 +185,6 @@ def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"
     shift = np.einsum("nm,smc->snc", move, people[:, loop])
     people[:, loop] += shift
     people[:, follows] += np.einsum("nm,smc->snc", spread, shift)
-
-
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _lowest_loop(border: Int[np.ndarray, "b 2"], height: Float[np.ndarray, " v"]) -> Int[np.ndarray, " n"]:
