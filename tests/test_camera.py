@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov, look_at
-from mien.capture.cameras.calibration import CalibratedCamera
 from mien.capture.cameras.head_path import consensus, find_head_path
 from mien.capture.cameras.readings import (
     Ranked,
     Reading,
     advice_of,
-    advise_on,
     is_wrong,
     rank_readings,
     readings_of,
@@ -280,8 +278,7 @@ def test_every_reading_is_named_in_any_world(marks: Tensor, rig: str, world: str
 
 def told_of(cameras: list[Camera], pixels: np.ndarray, capsys) -> str:
     """Return the warning about a calibration."""
-    calibrated = [CalibratedCamera(str(index), camera) for index, camera in enumerate(cameras)]
-    warn_of_misfit(calibrated, lambda _, camera: camera.camera, pixels)
+    warn_of_misfit(rank_readings(pixels, readings_of(cameras)))
     return capsys.readouterr().err
 
 
@@ -310,7 +307,6 @@ def test_ties_are_said_and_advice_is_part_of_the_refusal(marks: Tensor) -> None:
     assert advice_of(entries[1:]) == "write B (points of the face then agree within 0.8 px)"
     assert advice_of(entries[3:]) == ""
     given, pixels = written(RIGS["ring"], "room", "camera to world"), seen_by(RIGS["ring"], marks)
-    calibrated = [CalibratedCamera(str(index), camera) for index, camera in enumerate(given)]
     refusal = "no two cameras ever .*; the matrices go from camera to world, .* agree within"
     with pytest.raises(UserError, match=refusal):
-        find_head_path(boxes_of(pixels), given, lambda: advise_on(calibrated, lambda _, camera: camera.camera, pixels))
+        find_head_path(boxes_of(pixels), given, lambda: advice_of(rank_readings(pixels, readings_of(given))))

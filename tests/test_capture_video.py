@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from capture_helpers import BT2020, encode, hdr_signal, light_of, to_planes, write_gradient_video, write_planes
-from mien.media.camera_names import CameraName
 from mien.media.colors import HLG, PQ, Colors, roll_off, srgb_signal
-from mien.media.live_camera import LiveCamera
 from mien.media.video import count_frames, probe_video, read_video_frames, write_video
 from refusals import refuses
 
@@ -259,14 +257,3 @@ def test_wide_primaries_are_converted(kind, primaries, matrix, transfer, convert
     planes = [y, blue[::step, ::2], red[::step, ::2]]
     encode(tmp_path / kind, [planes] * 3, codec, pixels, options=options, colors=(matrix, primaries, transfer, LIMITED))
     assert error_of(tmp_path / kind) <= 4
-
-
-def test_a_file_that_plays_as_a_camera_has_the_same_colors(tmp_path):
-    path = tmp_path / "prores.mov"
-    true = Colors(HLG, 9, LIMITED)
-    write_color(path, "prores.mov", true, SILENT, true)
-    with LiveCamera(CameraName(str(path), "v4l2"), again=False) as camera:
-        camera.start()
-        frame = camera.newest(-1, 120.0)
-    assert frame is not None
-    assert np.abs(frame.picture.reshape(-1, 3).mean(axis=0) - COLOR).max() <= 4

@@ -11,7 +11,7 @@ from torch import Tensor
 from known import known
 from mien.camera import camera_from_fov
 from mien.face import FaceModel, FaceParams, load_face_model, loading
-from mien.face.parts import part_boxes
+from mien.face.head_parts import part_boxes
 from mien.face.posing import head_poses
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.tracking.landmarks import embedding

@@ -25,9 +25,7 @@ from mien.capture.capture import Capture
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
 from mien.errors import UserError
-from mien.media.camera_names import CameraName
 from mien.media.colors import HLG, srgb_signal
-from mien.media.live_camera import LiveCamera
 from mien.media.video import count_frames, probe_video, read_sound, read_video_frames, write_video
 from mien.pipeline import drive as driving
 from test_capture_parts import streak
@@ -300,11 +298,6 @@ def test_the_video_is_found_among_streams(name: str, ending: str, tmp_path: Path
     assert (info.stream, sorted(info.other_streams)) == (expected, [i for i in range(len(tracks)) if i != expected])
     assert count_frames(path) == frames
     assert [picture.shape for _, picture in read_video_frames(path)] == [(side, side, 3)] * frames
-    with LiveCamera(CameraName(str(path), "v4l2"), again=False) as camera:
-        camera.start()
-        live = camera.newest(-1, 20.0)
-    assert live is not None
-    assert live.picture.shape == (side, side, 3)
 
 
 def test_the_default_stream_counts_for_sound_too_and_thousands_of_frames_a_second_are_no_film(tmp_path: Path) -> None:

@@ -77,7 +77,6 @@ class CacheWriter:
     """Fills the raw files picture by picture, with plain writes: a full disk raises an error instead of crashing."""
 
     def __init__(self, layout: FrameLayout) -> None:
-        """Open the raw files. Their content is kept."""
         self._layout = layout
         (layout.folder / CACHE).mkdir(parents=True, exist_ok=True)
         self._files = {}
@@ -104,7 +103,6 @@ class FrameWriter:
     """Writes frames and mattes as PNGs and into the cache, on one thread beside the caller's. A context manager."""
 
     def __init__(self, layout: FrameLayout, camera: int | None = None) -> None:
-        """Prepare to write the pictures of all cameras, or of the one with this index."""
         self.layout = layout
         self._cameras = range(len(layout.camera_ids)) if camera is None else (camera,)
         shape = (layout.timesteps, len(layout.camera_ids))

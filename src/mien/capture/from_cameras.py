@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,13 +12,21 @@ from jaxtyping import Float
 
 from mien.camera import Camera
 from mien.capture.cameras.calibration import CalibratedCamera, match_sources, read_calibration
-from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path
-from mien.capture.cameras.readings import advise_on, landmarks_at, some_timesteps, warn_of_misfit
+from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path, project
+from mien.capture.cameras.readings import (
+    Reading,
+    advice_of,
+    is_wrong,
+    landmarks_at,
+    rank_readings,
+    readings_of,
+    some_timesteps,
+    warn_of_misfit,
+)
 from mien.capture.capture import Capture
-from mien.capture.frame_files import FRAMES, MATTES, FrameLayout
+from mien.capture.frame_files import FrameLayout
 from mien.capture.from_video import (
     RECIPE,
-    STATE,
     CaptureJob,
     capture_once,
     check_place,
@@ -34,12 +42,11 @@ from mien.capture.person.faces import LANDMARKS
 from mien.capture.person.given import with_own_alpha
 from mien.capture.person.people import Person, choose_person
 from mien.capture.person.survey import Survey, kind_report, survey_source, tell_fields, tell_kind
-from mien.capture.process import Chunk, FrameStream, join_chunks, join_digests, origin_of, process_part
-from mien.capture.quality import MEASURES, FrameQuality, frame_rate, quality_report, relative_quality, tell_pauses
+from mien.capture.process import Chunk, finish, join_chunks, origin_of, process_part
+from mien.capture.quality import frame_rate, tell_pauses
 from mien.capture.settings import CaptureSettings
-from mien.capture.store import check_room, finish_capture, partial_folder, read_capture
+from mien.capture.store import check_room, partial_folder, read_capture
 from mien.disk.files import file_digest
-from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import say
 
@@ -50,8 +57,6 @@ a false face, for example in hair seen from behind."""
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One camera, its video, and what is known of its pictures."""
-
     camera_id: str
     job: CaptureJob
     survey: Survey
@@ -173,7 +178,6 @@ def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, 
 
 
 def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
-    """Find the faces in all videos."""
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
         given = job.given()
@@ -215,8 +219,9 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
         parts.append(part)
         frames = view.job.frames
         given = with_own_alpha(view.job.given(), frames, view.survey.transparent)
-        folder = work / _chunks_of(view.camera_id)
-        chunks.append(process_part(FrameStream(frames), part, given, layout, folder, index, whole.detector))
+        folder = work / f"chunks-{view.camera_id}"
+        stream = enumerate(frames.frames())
+        chunks.append(process_part(stream, part, given, layout, folder, index, whole.detector))
     _finish(views, whole, path, parts, layout, chunks, out)
 
 
@@ -230,12 +235,21 @@ def _advice(views: list[_View], boxes: Float[np.ndarray, "t c 4"]) -> str:
             landmarks[:, index] = landmarks_at(view.job.frames, boxes[:, index], timesteps, view.job.detector)
         else:
             landmarks[:, index] = given[view.survey.numbers[timesteps]]
-    calibrated, sizes = [view.calibrated for view in views], [(view.camera.width, view.camera.height) for view in views]
-    return advise_on(
-        calibrated,
-        lambda index, camera: camera.for_pictures(*sizes[index]),
-        landmarks,
-    )
+    ranked = rank_readings(landmarks, _readings(views))
+    return advice_of(ranked) if is_wrong(ranked) else ""
+
+
+def _readings(views: list[_View], parts: Sequence[Part] = ()) -> list[Reading]:
+    """Return how the calibration may be read, for the source's pictures or for the captured parts of them."""
+
+    def fitted(index: int, camera: Camera) -> Camera:
+        camera = camera.resized(views[index].camera.width, views[index].camera.height)
+        return _cropped(camera, parts[index].crop) if parts else camera
+
+    return [
+        Reading(reading.remedies, tuple(fitted(*each) for each in enumerate(reading.cameras)))
+        for reading in readings_of([view.calibrated.camera for view in views])
+    ]
 
 
 def _finish(
@@ -249,56 +263,39 @@ def _finish(
 ) -> None:
     cameras = tuple(_cropped(view.camera, part.crop) for view, part in zip(views, parts, strict=True))
     landmarks = join_chunks(chunks, "landmarks")
-    sizes = [(view.camera.width, view.camera.height) for view in views]
-    warn_of_misfit(
-        [view.calibrated for view in views],
-        lambda index, camera: _cropped(camera.for_pictures(*sizes[index]), parts[index].crop),
-        landmarks,
-    )
+    warn_of_misfit(rank_readings(landmarks, _readings(views, parts)))
     _remove_astray(landmarks, path, cameras)
-    # The quality of each picture is relative to those of its own camera.
-    each = [relative_quality(np.concatenate([chunk.quality for chunk in camera])) for camera in chunks]
-    measures = (field.name for field in fields(FrameQuality))
-    quality = FrameQuality(*(np.concatenate([getattr(one, name) for one in each], axis=1) for name in measures))
     timestamps, valid = views[0].survey.timestamps, np.isfinite(landmarks[..., 0, 0])
-    capture = Capture(
-        name=whole.name,
-        camera_ids=layout.camera_ids,
-        fps=frame_rate(timestamps, whole.frames.fps),
-        timestamps=timestamps,
-        images=layout.blank(FRAMES),
-        mattes=layout.blank(MATTES),
-        landmarks=landmarks,
-        valid=valid,
-        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64),
-        source={
-            "key": whole.key,
-            "file": ", ".join(view.job.frames.path.name for view in views),
-            "content_hash": whole.frames.content_hash,
-            "cameras": {
-                view.camera_id: {"file": view.job.frames.path.name, **origin_of(part)}
-                for view, part in zip(views, parts, strict=True)
-            },
-            **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
-        },
-        calibration=cameras,
-        quality=quality,
-    )
     report = {
         "frames": len(timestamps),
         "frames_without_face": int((~valid.any(axis=1)).sum()),
         "faces_by_camera": dict(zip(layout.camera_ids, valid.sum(axis=0).tolist(), strict=True)),
         "kind_by_camera": {view.camera_id: kind_report(view.job.frames, view.survey) for view in views},
         **tell_pauses(whole.name, timestamps),
-        **quality_report(whole.name, quality, join_chunks(chunks, "quality").reshape(-1, MEASURES)),
     }
-    for leftover in (STATE, *map(_chunks_of, layout.camera_ids)):
-        remove_tree(layout.folder / leftover)
-    finish_capture(layout, out, capture, join_digests(chunks), report)
-
-
-def _chunks_of(camera_id: str) -> str:
-    return f"chunks-{camera_id}"
+    source = {
+        "key": whole.key,
+        "file": ", ".join(view.job.frames.path.name for view in views),
+        "content_hash": whole.frames.content_hash,
+        "cameras": {
+            view.camera_id: {"file": view.job.frames.path.name, **origin_of(part)}
+            for view, part in zip(views, parts, strict=True)
+        },
+        **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
+    }
+    finish(
+        layout,
+        out,
+        chunks,
+        report,
+        name=whole.name,
+        fps=frame_rate(timestamps, whole.frames.fps),
+        timestamps=timestamps,
+        landmarks=landmarks,
+        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64),
+        source=source,
+        calibration=cameras,
+    )
 
 
 def _cropped(camera: Camera, crop: Crop) -> Camera:
@@ -310,10 +307,9 @@ def _remove_astray(landmarks: Float[np.ndarray, "t c l 2"], path: HeadPath, came
     """Remove landmarks that were found far from the head, for example in hair seen from behind."""
     for index, camera in enumerate(cameras):
         found = landmarks[:, index]
-        inside = path.centers @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
-        centers = (inside @ camera.K.numpy().T)[:, :2] / inside[:, 2:]
         least, most = found.min(axis=1), found.max(axis=1)
         side = np.maximum((most - least).max(axis=1), 1.0)
         with np.errstate(invalid="ignore"):
-            is_astray = np.linalg.norm((least + most) / 2 - centers, axis=1) > _LANDMARKS_MOST_ASTRAY * side
+            away = np.linalg.norm((least + most) / 2 - project(path.centers, camera), axis=1)
+            is_astray = away > _LANDMARKS_MOST_ASTRAY * side
         found[is_astray] = np.nan

@@ -20,10 +20,20 @@ from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, FrameLayout
 from mien.capture.parts import Part, check_one_size, find_parts, number_parts, tell_who, whole_part
 from mien.capture.person.backend import Detector, choose_detector, detector_entry
+from mien.capture.person.faces import second_difference_jitter
 from mien.capture.person.given import GivenInputs, read_given, with_own_alpha
 from mien.capture.person.people import face_shapes, group_people, shape_difference
-from mien.capture.person.survey import Survey, check_upright, survey_source, tell_fields, tell_kind
-from mien.capture.process import CAMERA_ID, Chunk, FrameStream, finish_part, origin_of, process_part
+from mien.capture.person.survey import (
+    Survey,
+    check_upright,
+    kind_report,
+    no_face,
+    survey_source,
+    tell_fields,
+    tell_kind,
+)
+from mien.capture.process import Chunk, Stream, finish, join_chunks, origin_of, process_part
+from mien.capture.quality import frame_rate, pace_report
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, check_room, partial_folder, read_capture
 from mien.disk.files import cannot_write, file_digest, read_json, write_json
@@ -100,13 +110,11 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
     check_place(out, job)
     scratch = partial_folder(out).with_suffix(".survey")
     with cleaning_up(out, scratch) as survey_folder:
-        given = job.given()
-        survey, given = _run_survey(job, survey_folder, given)
+        survey, given = _run_survey(job, survey_folder)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
-        key = _part_key(job, 1, 1)
-        draft = _draft(job, FrameStream(job.frames), part, key, given, out)
+        draft = _draft(job, enumerate(job.frames.frames()), part, (1, 1), given, out)
         if draft is not None:
-            _finish(job, draft, key, (1, 1), given, out)
+            _finish(job, draft, (1, 1), given, out)
     return read_capture(out)
 
 
@@ -131,8 +139,7 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
     for first in (job.name, f"{job.name}-1"):
         check_place(_capture_dir(sequences, first), job)
     with cleaning_up(_capture_dir(sequences, job.name), sequences / f".{job.name}.survey") as survey_folder:
-        given = job.given()
-        survey, given = _run_survey(job, survey_folder, given)
+        survey, given = _run_survey(job, survey_folder)
         parts = find_parts(survey, job.settings, job.frames.path, job.name)
         with hold(*(sequences / part.name for part in parts if part.name != job.name)):
             for part in parts:
@@ -144,10 +151,10 @@ def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
 
 def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], given: GivenInputs) -> list[Part]:
     """Capture the parts that show the person of the settings, and return them under their final names."""
-    stream, drafts = FrameStream(job.frames), []
+    stream, drafts = enumerate(job.frames.frames()), []
     for number, part in enumerate(parts, 1):
         out = _capture_dir(sequences, part.name)
-        drafts.append(_draft(job, stream, part, _part_key(job, number, len(parts)), given, out))
+        drafts.append(_draft(job, stream, part, (number, len(parts)), given, out))
     unfinished = [draft for draft in drafts if draft is not None]
     if len(unfinished) == len(parts) and job.settings.person:
         # Parts that are finished were compared by the call that was interrupted.
@@ -161,7 +168,7 @@ def _capture_one_person(sequences: Path, job: CaptureJob, parts: list[Part], giv
         if draft is not None:
             place, out = (number, len(parts)), _capture_dir(sequences, part.name)
             out.parent.mkdir(exist_ok=True)
-            _finish(job, replace(draft, part=part), _part_key(job, *place), place, given, out)
+            _finish(job, replace(draft, part=part), place, given, out)
     _discard(unfinished)
     return parts
 
@@ -316,8 +323,8 @@ def prepare(work: Path, key: str) -> Path:
     return work
 
 
-def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Survey, GivenInputs]:
-    """Return the survey, and what is given with the alpha of the source."""
+def _run_survey(job: CaptureJob, folder: Path) -> tuple[Survey, GivenInputs]:
+    given = job.given()
     tell_kind(job.frames)
     survey = survey_source(job.frames, prepare(folder, job.key), given.landmarks, job.detector)
     given = with_own_alpha(given, job.frames, survey.transparent)
@@ -329,27 +336,59 @@ def _run_survey(job: CaptureJob, folder: Path, given: GivenInputs) -> tuple[Surv
     return survey, given
 
 
-def _draft(job: CaptureJob, stream: FrameStream, part: Part, key: str, given: GivenInputs, out: Path) -> Draft | None:
+def _draft(
+    job: CaptureJob, stream: Stream, part: Part, place: tuple[int, int], given: GivenInputs, out: Path
+) -> Draft | None:
     """Write the frames and mattes of a part beside `out`, or return None if the part is finished."""
+    key = _part_key(job, *place)
     if read_finished(out, key) is not None:
         return None
     work = prepare(partial_folder(out), key)
-    layout = FrameLayout(work, (CAMERA_ID,), part.timesteps, part.crop.height, part.crop.width)
+    layout = FrameLayout(work, ("0",), part.timesteps, part.crop.height, part.crop.width)
     check_room(layout, part.name, out)
     return Draft(part, layout, process_part(stream, part, given, layout, work / _CHUNKS, detector=job.detector))
 
 
-def _finish(job: CaptureJob, draft: Draft, key: str, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
-    detector = job.detector if given.landmarks is None else "mediapipe"
+def _finish(job: CaptureJob, draft: Draft, place: tuple[int, int], given: GivenInputs, out: Path) -> None:
+    part, survey = draft.part, draft.part.survey
+    landmarks = join_chunks([draft.chunks], "landmarks")
+    missed = int(np.isnan(landmarks[:, 0, 0, 0]).sum())
+    if missed == len(landmarks):
+        remove_tree(draft.layout.folder)
+        raise no_face(job.frames.path, missed)
+    timestamps, jitter = survey.timestamps - survey.timestamps[0], second_difference_jitter(landmarks[:, 0])
+    taken_off = np.concatenate([chunk.taken_off for chunk in draft.chunks])
+    report = {
+        "frames": len(landmarks),
+        "frames_without_face": missed,
+        "frames_with_several_faces": int(part.person.crowded.sum()),
+        "matte_pixels_taken_off": round(float(taken_off.mean()), 1),
+        "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
+        **kind_report(job.frames, survey),
+        **pace_report(part.name, timestamps),
+    }
+    if missed:
+        say(f"{part.name}: no face in {missed} of {len(landmarks)} frames; they are left out")
     source = {
-        "key": key,
+        "key": _part_key(job, *place),
         "file": job.frames.path.name,
         "content_hash": job.frames.content_hash,
-        **origin_of(draft.part),
+        **origin_of(part),
         "part": {"of": job.name, "number": place[0], "count": place[1]},
-        **detector_entry(detector),
+        **detector_entry(job.detector if given.landmarks is None else "mediapipe"),
     }
-    finish_part(draft.layout, out, draft.chunks, draft.part, job.frames, source, (STATE, _CHUNKS))
+    finish(
+        draft.layout,
+        out,
+        [draft.chunks],
+        report,
+        name=part.name,
+        fps=frame_rate(timestamps, job.frames.fps),
+        timestamps=timestamps,
+        landmarks=landmarks,
+        principal_point=part.crop.to_output(survey.picture_size / 2)[None],
+        source=source,
+    )
 
 
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:

@@ -24,7 +24,6 @@ _CUT_NEIGHBORS = 4
 """Frames on either side of a cut in which the picture may change only a little: motion lasts longer than a cut."""
 _CUT_LEAST_CHANGE = 0.05  # smallest change at a cut, as a fraction of the mean brightness
 _CUT_LEAST_CONTRAST = 3.0  # factor by which the change at a cut exceeds the changes beside it
-_FACELESS = "parts without a face"
 _CUT_BLOCKS = (3, 4)
 """Rows and columns of blocks. The change is that of half of the blocks, or of the face's place if that is larger. The
 quarter that changes most also has captions in it, which cost 47 to 67 % of the frames of such videos."""
@@ -58,10 +57,7 @@ def whole_part(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     cuts = find_cuts(survey.thumbnails, survey.boxes) if settings.cuts else []
     if cuts:
         say(f"warning: {path}: the video cuts to another shot at {_list_times(survey, cuts)}; tracking may fail there")
-    part = _make_part(survey, 0, settings, name)
-    if part is None:
-        raise no_face(path, len(survey.timestamps))
-    _tell_people(path, part)
+    (part,) = find_parts(survey, replace(settings, cuts=False), path, name)
     return part
 
 
@@ -94,9 +90,8 @@ def find_parts(survey: Survey, settings: CaptureSettings, path: Path, name: str)
     if not found:
         raise no_face(path, len(survey.timestamps))
     keeps = "--capture.shortest-part keeps shorter ones" + ("" if turns else ", --capture.no-cuts all")
-    _tell_left_out(
-        path, survey, {f"parts shorter than {settings.shortest_part:g} s": short, _FACELESS: faceless}, keeps
-    )
+    shorter = f"parts shorter than {settings.shortest_part:g} s"
+    _tell_left_out(path, survey, [(shorter, short, f"; {keeps}"), ("parts without a face", faceless, "")])
     parts = number_parts(found, name)
     if cuts:
         say(f"{path}: cuts to another shot at {_list_times(survey, cuts)}: {', '.join(part.name for part in parts)}")
@@ -120,25 +115,24 @@ def _change_of_size(survey: Survey, frame: int) -> str:
     return f"the picture changes from {before} to {after} at {_list_times(survey, [frame])}"
 
 
-def _tell_left_out(path: Path, survey: Survey, left_out: dict[str, list[tuple[int, int]]], keeps: str) -> None:
-    """Say which frames belong to no part, by the reason. It is a warning if they are more than a tenth."""
+def _tell_left_out(path: Path, survey: Survey, left_out: list[tuple[str, list[tuple[int, int]], str]]) -> None:
+    """Say which frames belong to no part, and why. It is a warning with a remedy if they are more than a tenth."""
     total = len(survey.timestamps)
-    many = sum(stop - start for spans in left_out.values() for start, stop in spans) > 0.1 * total
-    for why, spans in left_out.items():
+    many = sum(stop - start for _, spans, _ in left_out for start, stop in spans) > 0.1 * total
+    for why, spans, remedy in left_out:
         if spans:
             frames = sum(stop - start for start, stop in spans)
-            at = _list_times(survey, [start for start, _ in spans])
             say(
-                f"{'warning: ' if many else ''}{path}: {len(spans)} {why} are left out, at {at}: {frames} of "
-                f"{counted(total, 'frame')}{f'; {keeps}' if many and why != _FACELESS else ''}"
+                f"{'warning: ' if many else ''}{path}: {len(spans)} {why} are left out, at "
+                f"{_list_times(survey, [start for start, _ in spans])}: {frames} of {counted(total, 'frame')}"
+                f"{remedy if many else ''}"
             )
 
 
 def number_parts(parts: list[Part], name: str) -> list[Part]:
     """Return the parts under their names: a single part is called `name`, several `name`-1, `name`-2, ..."""
-    if len(parts) == 1:
-        return [replace(parts[0], name=name)]
-    return [replace(part, name=f"{name}-{number}") for number, part in enumerate(parts, 1)]
+    names = [f"{name}-{number}" for number in range(1, len(parts) + 1)] if len(parts) > 1 else [name]
+    return [replace(part, name=each) for part, each in zip(parts, names, strict=True)]
 
 
 def _make_part(survey: Survey, start: int, settings: CaptureSettings, name: str) -> Part | None:
@@ -182,7 +176,6 @@ def tell_who(path: Path, parts: Sequence[Part], people: Sequence[Sequence[int]],
 
 
 def _list_times(survey: Survey, frames: list[int]) -> str:
-    """List the times of up to five frames, for messages."""
     listed = ", ".join(f"{survey.timestamps[frame]:.1f}" for frame in frames[:5])
     return f"{listed}{', ...' if len(frames) > 5 else ''} s"
 
@@ -235,7 +228,6 @@ def _difference(
 
 
 def _inside(picture: Float[np.ndarray, "h w"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "h2 w2"]:
-    """Return the part of a picture in a box, at least one pixel."""
     height, width = picture.shape
     left, right = np.clip([np.floor(box[0] * width), np.ceil(box[2] * width)], 0, width).astype(int)
     top, bottom = np.clip([np.floor(box[1] * height), np.ceil(box[3] * height)], 0, height).astype(int)

@@ -10,27 +10,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt64
+from jaxtyping import Float, UInt8, UInt64
 
 from mien.capture.capture import Capture
-from mien.capture.frame_files import FRAMES, MATTES, FrameLayout, FrameWriter
+from mien.capture.frame_files import CACHE, FRAMES, MATTES, FrameLayout, FrameWriter
 from mien.capture.parts import Part
 from mien.capture.person.backend import DetectorChoice
 from mien.capture.person.crop import Crop
-from mien.capture.person.faces import LANDMARKS, LandmarkDetector, second_difference_jitter
+from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.capture.person.given import GivenInputs
 from mien.capture.person.matte import MakeMatte, choose_matting, held, without_others
 from mien.capture.person.people import Person
 from mien.capture.person.plate import screen_of, without_screen
-from mien.capture.person.survey import Survey, kind_report, no_face
-from mien.capture.quality import MEASURES, frame_rate, measure_face, pace_report, quality_report, relative_quality
+from mien.capture.person.survey import Survey, read_saved
+from mien.capture.quality import MEASURES, FrameQuality, measure_face, quality_report, relative_quality
 from mien.capture.store import finish_capture
-from mien.disk.files import expect_whole, read_arrays, write_arrays
+from mien.disk.files import write_arrays
 from mien.disk.inside import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import brought_to
-from mien.media.source import FrameSource
 from mien.media.video import LazyFrame
 
 _MATTE_HELD_FRAMES = 12  # frames before and after in which another face still counts where it is not found
@@ -57,28 +56,9 @@ class Chunk:
     frame_digests: UInt64[np.ndarray, "t 1"]
     matte_digests: UInt64[np.ndarray, "t 1"]
 
-    @property
-    def valid(self) -> Bool[np.ndarray, " t"]:
-        """Frames in which a face was found."""
-        return np.isfinite(self.landmarks[:, 0, 0])
 
-
-class FrameStream:
-    """The frames of a source, read once and in order."""
-
-    def __init__(self, frames: FrameSource) -> None:
-        self.path = frames.path
-        self._stream = frames.frames()
-        self._position = 0
-
-    def from_frame(self, start: int) -> Iterator[LazyFrame]:
-        """Yield the frames from index `start` (among those taken) on. They must not have been read yet."""
-        assert start >= self._position, (start, self._position)
-        for _ in itertools.islice(self._stream, start - self._position):
-            self._position += 1
-        for frame in self._stream:
-            self._position += 1
-            yield frame
+Stream = Iterator[tuple[int, LazyFrame]]
+"""The frames taken from a source with their numbers among these, read once and in order by one part after another."""
 
 
 class LandmarkFollower:
@@ -94,25 +74,19 @@ class LandmarkFollower:
 
     def find(self, timestep: int, image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "l 2"] | None:
         """Return the person's landmarks in the next picture, in pixels, or None if the face is not found."""
-        faces = self._detector.detect(image)
-        expected = self._expected(timestep)
-        if expected is None:
+        faces, chosen = self._detector.detect(image), None
+        # The box where the face should be: the survey's, or else that of the last landmarks if they are recent.
+        if np.isfinite(self._boxes[timestep, 0]):
+            chosen = self._nearest(faces, self._boxes[timestep], self._others[timestep])
+        elif self._last is not None and abs(timestep - self._last[0]) <= _FACE_MOST_AGE:
+            chosen = self._nearest(faces, _box(self._last[1]), self._others[timestep])
+        elif self._is_alone and len(faces):
             # The two detectors differ. If the clip never shows anybody else, any face that is detected here is the
             # person.
-            chosen = faces[0] if self._is_alone and len(faces) else None
-        else:
-            chosen = self._nearest(faces, expected, self._others[timestep])
+            chosen = faces[0]
         if chosen is not None:
             self._last = timestep, chosen
         return chosen
-
-    def _expected(self, timestep: int) -> Float[np.ndarray, " 4"] | None:
-        """Return the box where the face should be: the survey's, or else that of the last landmarks if recent."""
-        if np.isfinite(self._boxes[timestep, 0]):
-            return self._boxes[timestep]
-        if self._last is None or abs(timestep - self._last[0]) > _FACE_MOST_AGE:
-            return None
-        return _box(self._last[1])
 
     @staticmethod
     def _nearest(faces: np.ndarray, expected: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "l 2"] | None:
@@ -139,24 +113,22 @@ def _box(landmarks: Float[np.ndarray, "l 2"]) -> Float[np.ndarray, " 4"]:
 class PartProcessor:
     """Processes the frames of one part in order, a chunk at a time."""
 
-    def __init__(
-        self, stream: FrameStream, part: Part, given: GivenInputs, done: int, detector: DetectorChoice
-    ) -> None:
+    def __init__(self, stream: Stream, part: Part, given: GivenInputs, done: int, detector: DetectorChoice) -> None:
         """Prepare to process the part, skipping its first `done` frames."""
-        self._path, self._part, self._given = stream.path, part, given
+        self._part, self._given = part, given
         self._detector: DetectorChoice = detector
         others = held(part.person.others, _MATTE_HELD_FRAMES) * np.tile(part.survey.picture_size, 2)
         self._others = _to_crop(others, part.crop)
-        begin = done - _LEAD_IN if done >= _LEAD_IN else 0
-        left = part.timesteps - begin
-        self._stream = itertools.islice(stream.from_frame(part.start + begin), left)
+        begin = max(done - _LEAD_IN, 0)
+        own = (frame for number, frame in stream if number >= part.start + begin)
+        self._pictures = map(self._cropped, itertools.islice(own, part.timesteps - begin))
         self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=_LEAD_IN)
         """Timesteps and pictures of the latest frames; before the first frame, of the next ones in reverse order."""
         self._keys = given.plate is None and given.mattes is None
         if begin == 0:
-            ahead = [self._cropped(frame) for frame in itertools.islice(self._stream, _LEAD_IN + 1)]
-            self._recent.extend((index, image) for index, (_, image) in reversed(list(enumerate(ahead))[1:]))
-            self._pictures = itertools.chain(ahead, map(self._cropped, self._stream))
+            ahead = list(itertools.islice(self._pictures, _LEAD_IN + 1))
+            self._recent.extend((index, ahead[index][1]) for index in range(len(ahead) - 1, 0, -1))
+            self._pictures = itertools.chain(ahead, self._pictures)
             screen = screen_of(ahead[0][1]) if self._keys else None
             if screen is not None:
                 red, green, blue = (round(255 * float(level)) for level in screen)
@@ -164,8 +136,6 @@ class PartProcessor:
                     f"{part.name}: the background is an even screen (red {red}, green {green}, blue {blue} of 255); it "
                     "gives the mattes, and its light is taken off the edges; give --capture.mattes if they are wrong"
                 )
-        else:
-            self._pictures = map(self._cropped, self._stream)
         before = itertools.islice(self._pictures, done - begin)
         self._recent.extend((begin + index, image) for index, (_, image) in enumerate(before))
 
@@ -175,7 +145,7 @@ class PartProcessor:
         landmarks = np.full((count, LANDMARKS, 2), np.nan, np.float32)
         quality = np.full((count, MEASURES), np.nan, np.float32)
         taken_off = np.zeros(count, np.float32)
-        done = 0
+        index = -1
         with ExitStack() as stack:
             follower = None
             if self._given.landmarks is None:
@@ -204,10 +174,9 @@ class PartProcessor:
                 writer.submit(timestep, make)
                 self._recent.append((timestep, image))
                 advance()
-                done += 1
             writer.flush()
-        if done < count:
-            raise UserError(f"{self._path}: has fewer frames than before; wait until it is complete, then run it again")
+        if index + 1 < count:
+            raise UserError(f"{part.name}: has fewer frames than before; wait until it is complete, then run it again")
         span = slice(start, start + count), slice(camera, camera + 1)
         return Chunk(landmarks, quality, taken_off, writer.digests[FRAMES][span], writer.digests[MATTES][span])
 
@@ -216,15 +185,8 @@ class PartProcessor:
         return frame.number, self._part.crop.apply(brought_to(frame.picture(), (width, height)))
 
 
-def _read(path: Path) -> Chunk:
-    """Read a chunk that an interrupted call saved."""
-    arrays = read_arrays(path)
-    with expect_whole(path, "delete its folder and run `mien capture` again"):
-        return Chunk(**arrays)
-
-
 def process_part(
-    stream: FrameStream,
+    stream: Stream,
     part: Part,
     given: GivenInputs,
     layout: FrameLayout,
@@ -235,8 +197,8 @@ def process_part(
     """Process a part as one camera of the layout. Chunks that an interrupted call left in `work` are kept."""
     work.mkdir(exist_ok=True)
     paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, CHUNK)}
-    chunks = [_read(path) for path in itertools.takewhile(Path.exists, paths.values())]
-    done = sum(len(chunk.valid) for chunk in chunks)
+    chunks = [read_saved(path, Chunk) for path in itertools.takewhile(Path.exists, paths.values())]
+    done = sum(len(chunk.landmarks) for chunk in chunks)
     if done == layout.timesteps:
         return chunks
     processor = PartProcessor(stream, part, given, done, detector)
@@ -270,18 +232,9 @@ def _finish(
     return (image if screen is None else without_screen(image, matte, screen))[None], matte[None]
 
 
-CAMERA_ID = "0"
-
-
 def join_chunks(chunks: Sequence[Sequence[Chunk]], name: str) -> np.ndarray:
     """Join an array of the chunks of each camera over time, and of all cameras along the second axis."""
     return np.stack([np.concatenate([getattr(chunk, name) for chunk in camera]) for camera in chunks], axis=1)
-
-
-def join_digests(chunks: Sequence[Sequence[Chunk]]) -> dict[str, UInt64[np.ndarray, "t c"]]:
-    """Return the digests of all frames and mattes."""
-    names = {FRAMES: "frame_digests", MATTES: "matte_digests"}
-    return {kind: join_chunks(chunks, name)[..., 0] for kind, name in names.items()}
 
 
 def origin_of(part: Part) -> dict[str, Any]:
@@ -294,53 +247,29 @@ def origin_of(part: Part) -> dict[str, Any]:
     }
 
 
-def finish_part(
-    layout: FrameLayout,
-    out: Path,
-    chunks: list[Chunk],
-    part: Part,
-    frames: FrameSource,
-    source: dict[str, Any],
-    leftovers: tuple[str, ...],
+def finish(
+    layout: FrameLayout, out: Path, chunks: Sequence[Sequence[Chunk]], report: dict[str, Any], **facts: Any
 ) -> None:
-    """Step 5: write the results of all frames beside them, remove `leftovers` in the folder and rename it to `out`.
+    """Step 5: write the results of all frames beside them, remove the unfinished work, and rename the folder to `out`.
 
-    `source` is the capture's, without what `origin_of` says.
+    `chunks` are those of each camera. `facts` are what the fields of the `Capture` are that do not follow from these.
     """
-    landmarks, measured = (join_chunks([chunks], name) for name in ("landmarks", "quality"))
-    valid = np.isfinite(landmarks[..., 0, 0])
-    if not valid.any():
-        remove_tree(layout.folder)
-        raise no_face(frames.path, len(valid))
-    survey = part.survey
-    timestamps = survey.timestamps - survey.timestamps[0]
-    quality = relative_quality(measured[:, 0])
+    measured = join_chunks(chunks, "quality")
+    # The quality of each picture is relative to those of its own camera.
+    each = [vars(relative_quality(measured[:, camera])) for camera in range(len(chunks))]
+    quality = FrameQuality(**{name: np.concatenate([one[name] for one in each], axis=1) for name in each[0]})
     capture = Capture(
-        name=part.name,
         camera_ids=layout.camera_ids,
-        fps=frame_rate(timestamps, frames.fps),
-        timestamps=timestamps,
         images=layout.blank(FRAMES),
         mattes=layout.blank(MATTES),
-        landmarks=landmarks,
-        valid=valid,
-        principal_point=part.crop.to_output(survey.picture_size / 2)[None],
-        source=source,
+        valid=np.isfinite(facts["landmarks"][..., 0, 0]),
         quality=quality,
+        **facts,
     )
-    jitter, missed = second_difference_jitter(landmarks[:, 0]), int((~valid).sum())
-    report = {
-        "frames": len(valid),
-        "frames_without_face": missed,
-        "frames_with_several_faces": int(part.person.crowded.sum()),
-        "matte_pixels_taken_off": round(float(np.concatenate([chunk.taken_off for chunk in chunks]).mean()), 1),
-        "landmark_jitter_px": jitter if np.isfinite(jitter) else None,
-        **kind_report(frames, survey),
-        **pace_report(part.name, timestamps),
-    }
-    if missed:
-        say(f"{part.name}: no face in {missed} of {len(valid)} frames; they are left out")
-    report |= quality_report(part.name, quality, measured[:, 0])
-    for name in leftovers:
-        remove_tree(layout.folder / name)
-    finish_capture(layout, out, capture, join_digests([chunks]), report)
+    report |= quality_report(capture.name, quality, measured.reshape(-1, MEASURES))
+    for entry in layout.folder.iterdir():
+        if entry.name not in (FRAMES, MATTES, CACHE):
+            remove_tree(entry)
+    names = {FRAMES: "frame_digests", MATTES: "matte_digests"}
+    digests = {kind: join_chunks(chunks, name)[..., 0] for kind, name in names.items()}
+    finish_capture(layout, out, capture, digests, report)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar
 from mien.camera import Box, Camera
+from mien.face.head_parts import part_boxes
 from mien.face.params import FaceParams
-from mien.face.parts import part_boxes
 from mien.gaussians import Gaussians, Rendering
 from mien.render import rasterize
 from mien.render.closing import close_holes

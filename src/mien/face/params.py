@@ -29,7 +29,6 @@ class FaceParams:
     """Static offsets of this subject's vertices in the head frame, in metres."""
 
     def __len__(self) -> int:
-        """The number of timesteps, b."""
         return self.expression.shape[0]
 
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> "FaceParams":

@@ -37,7 +37,6 @@ class CameraName:
         return not self.is_stream and Path(self.device).is_file()
 
     def __str__(self) -> str:
-        """The name as it is typed."""
         return f"camera:{self.device}"
 
 

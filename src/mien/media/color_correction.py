@@ -5,7 +5,7 @@ neural networks and polynomial transforms"). It takes linear light, not sRGB val
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
@@ -53,8 +53,9 @@ class ColorCorrection:
         pixels = np.ascontiguousarray(picture).reshape(-1, 3)
         corrected = np.empty_like(pixels)
         for start in range(0, len(pixels), _CHUNK):
-            light = to_light[pixels[start : start + _CHUNK].T]
-            found = matrix @ _expanded(light, terms)
+            channels = dict(zip("rgb", to_light[pixels[start : start + _CHUNK].T], strict=True))
+            channels["1"] = np.ones_like(channels["r"])
+            found = matrix @ np.stack([reduce(np.multiply, map(channels.get, term)) for term in terms])
             steps = (np.clip(found, 0, 1) * (_STEPS - 1) + np.float32(0.5)).astype(np.intp)
             corrected[start : start + _CHUNK] = to_srgb[steps].T
         return corrected.reshape(picture.shape)
@@ -84,23 +85,6 @@ def correction_of_entry(entry: dict[str, Any], where: str) -> ColorCorrection | 
             f"{where}: {NAME} {given!r:.60} is not three rows of numbers; give the coefficients of each channel"
         )
     return color_correction(matrix, f"{where}: {NAME}")
-
-
-def _expanded(light: Float[np.ndarray, "3 p"], terms: tuple[str, ...]) -> Float[np.ndarray, "n p"]:
-    """Return all terms of some pixels."""
-    found = np.empty((len(terms), light.shape[1]), np.float32)
-    rows = {"": np.float32(1), **dict(zip("rgb", light, strict=True))}
-    for index, term in enumerate(terms):
-        word = term.removeprefix("1")
-        found[index] = rows[word] if word in rows else _product(word, rows)
-        rows[word] = found[index]
-    return found
-
-
-def _product(word: str, rows: dict[str, Any]) -> np.ndarray:
-    """Return the product of a word's channels. A product that is there already is used."""
-    begun = word[:-1]
-    return (rows[begun] if begun in rows else _product(begun, rows)) * rows[word[-1]]
 
 
 @lru_cache(maxsize=1)

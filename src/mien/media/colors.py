@@ -177,6 +177,5 @@ def _levels_of_light() -> UInt8[np.ndarray, " n"]:
 
 @cache
 def _light_of_levels() -> Float[np.ndarray, " 256"]:
-    """Return the light 0..1 of sRGB's levels."""
     light = np.linspace(0, 1, 1 << 16)
     return np.interp(np.arange(256) / 255, srgb_signal(light), light).astype(np.float32)

@@ -7,6 +7,8 @@ no more space and training than before. The second moments would add little: a h
 Frames that do not say that they are interlaced pass unchanged, bit by bit.
 """
 
+import contextlib
+import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -68,67 +70,48 @@ class FieldOrder(NamedTuple):
 
 
 def deinterlace(frames: Iterable[av.VideoFrame], order: FieldOrder, mode: Deinterlace) -> Iterator[FieldFrame]:
-    """Yield every decoded frame with its picture, in order. At most two frames are held."""
-    graph: _Graph | None = None
-    for frame in frames:
-        if graph is not None and not graph.fits(frame):
-            yield from graph.finish()
-            graph = None
-        unfit = order.has_field_pictures or min(frame.width, frame.height) < _LEAST_SIDE
-        marked = frame.interlaced_frame or order.is_interlaced
-        if graph is None and not unfit and (mode == "always" or (mode == "auto" and marked)):
-            graph = _Graph(frame, order, mode)
-        if graph is None:
-            yield FieldFrame(frame, frame, False)
+    """Yield every decoded frame with its picture, in order. At most three frames are held."""
+    for (width, height, _), alike in itertools.groupby(
+        frames, lambda frame: (frame.width, frame.height, frame.format.name)
+    ):
+        if mode == "never" or order.has_field_pictures or min(width, height) < _LEAST_SIDE:
+            yield from (FieldFrame(frame, frame, False) for frame in alike)
         else:
-            yield from graph.push(frame)
-    if graph is not None:
-        yield from graph.finish()
+            yield from _deinterlaced(alike, order, mode == "always" or order.is_interlaced)
 
 
-class _Graph:
-    """FFmpeg's filter for frames of one size and format."""
-
-    def __init__(self, first: av.VideoFrame, order: FieldOrder, mode: Deinterlace) -> None:
-        self._kind = _kind(first)
-        self._takes_all = mode == "always" or order.is_interlaced
-        parity = "auto" if first.interlaced_frame else order.parity
-        self._graph = Graph()
-        source = self._graph.add_buffer(
-            width=first.width, height=first.height, format=first.format, time_base=first.time_base or Fraction(1, 1000)
-        )
-        wanted = f"mode=send_frame:parity={parity}:deint={'all' if self._takes_all else 'interlaced'}"
-        steps: list[FilterContext] = [source, self._graph.add("bwdif", wanted), self._graph.add("buffersink")]
-        self._graph.link_nodes(*steps).configure()
-        self._waiting: deque[av.VideoFrame] = deque()
-
-    def fits(self, frame: av.VideoFrame) -> bool:
-        return _kind(frame) == self._kind
-
-    def push(self, frame: av.VideoFrame) -> Iterator[FieldFrame]:
-        """Take the next frame, and yield those that are ready: the filter looks one frame ahead."""
-        self._waiting.append(frame)
-        self._graph.vpush(frame)
-        yield from self._pull()
-
-    def finish(self) -> Iterator[FieldFrame]:
-        """Yield the frames that are left."""
-        self._graph.vpush(None)
-        yield from self._pull()
-        assert not self._waiting, len(self._waiting)
-
-    def _pull(self) -> Iterator[FieldFrame]:
-        while self._waiting:
-            try:
-                shown = self._graph.vpull()
-            except (av.error.BlockingIOError, av.error.EOFError):
-                return
-            stored = self._waiting.popleft()
-            yield FieldFrame(stored, shown, self._takes_all or stored.interlaced_frame)
+def _deinterlaced(frames: Iterable[av.VideoFrame], order: FieldOrder, takes_all: bool) -> Iterator[FieldFrame]:
+    """Deinterlace frames of one size and format, from the first that is marked on."""
+    graph: Graph | None = None
+    waiting: deque[av.VideoFrame] = deque()
+    for frame in itertools.chain(frames, (None,)):
+        if graph is None and frame is not None and (takes_all or frame.interlaced_frame):
+            graph = _filter(frame, order, takes_all)
+        if graph is None:
+            if frame is not None:
+                yield FieldFrame(frame, frame, False)
+            continue
+        if frame is not None:
+            waiting.append(frame)
+        graph.vpush(frame)
+        # The filter looks one frame ahead.
+        with contextlib.suppress(av.error.BlockingIOError, av.error.EOFError):
+            while waiting:
+                shown, stored = graph.vpull(), waiting.popleft()
+                yield FieldFrame(stored, shown, takes_all or stored.interlaced_frame)
+    assert not waiting, len(waiting)
 
 
-def _kind(frame: av.VideoFrame) -> tuple[int, int, str]:
-    return frame.width, frame.height, frame.format.name
+def _filter(first: av.VideoFrame, order: FieldOrder, takes_all: bool) -> Graph:
+    parity = "auto" if first.interlaced_frame else order.parity
+    graph = Graph()
+    source = graph.add_buffer(
+        width=first.width, height=first.height, format=first.format, time_base=first.time_base or Fraction(1, 1000)
+    )
+    wanted = f"mode=send_frame:parity={parity}:deint={'all' if takes_all else 'interlaced'}"
+    steps: list[FilterContext] = [source, graph.add("bwdif", wanted), graph.add("buffersink")]
+    graph.link_nodes(*steps).configure()
+    return graph
 
 
 def combs(frame: av.VideoFrame) -> float:

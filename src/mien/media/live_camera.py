@@ -9,21 +9,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import av
 import av.error
 import numpy as np
 from av.container import InputContainer
-from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from mien.errors import UserError
 from mien.media.camera_names import CameraName, remedy
-from mien.media.colors import UNSPECIFIED
 from mien.media.display import Display, brought_to, has_shape
-from mien.media.video import DEFAULT_FPS
-from mien.media.video_file import find_streams, open_video, read_container_tags
+from mien.media.video import read_lazily
+from mien.media.video_file import open_video
 
 _LIVE_SIDE = 640  # longest side in pixels of a camera's pictures that are kept
 
@@ -32,8 +31,9 @@ _ASKED = {"framerate": "30", "video_size": "640x480"}
 _STREAM = {"flags": "low_delay", "timeout": "5000000"}
 """What a stream is asked for: no reordering, and an error after five seconds without an answer (in microseconds)."""
 _RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
-_Opened = tuple[contextlib.ExitStack, Iterator[tuple[float, av.VideoFrame]]]
-"""What closes a source, and its frames with their times in seconds."""
+_Frames = Iterator[tuple[float, Callable[[], np.ndarray]]]
+_Opened = tuple[contextlib.ExitStack, _Frames]
+"""What closes a source, and what makes its pictures, each with the time in seconds at which a file shows it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,6 @@ class LiveCamera:
         self._thread = threading.Thread(target=self._run, name="mien-camera", daemon=True)
 
     def __enter__(self) -> "LiveCamera":
-        """Open the camera."""
         self._opened = self._open()
         return self
 
@@ -109,8 +108,12 @@ class LiveCamera:
 
     def _open(self) -> _Opened:
         stack = contextlib.ExitStack()
-        source = _file(Path(self.name.device)) if self.name.is_file else _device(self.name)
-        return stack, stack.enter_context(source)
+        if not self.name.is_file:
+            return stack, _device_frames(stack.enter_context(_open_device(self.name)), self.name)
+        path = Path(self.name.device)
+        with open_video(path):  # refuses what is no video before the thread starts
+            frames = stack.enter_context(contextlib.closing(read_lazily(path, _LIVE_SIDE)))
+        return stack, ((frame.seconds, frame.picture) for frame in frames)
 
     def _run(self) -> None:
         try:
@@ -140,30 +143,25 @@ class LiveCamera:
         except UserError:
             return None
 
-    def _read(self, source: contextlib.ExitStack, frames: Iterator[tuple[float, av.VideoFrame]]) -> None:
+    def _read(self, source: contextlib.ExitStack, frames: _Frames) -> None:
         """Keep each frame when it comes, until the end or an error of the device."""
-        container = UNSPECIFIED
-        if self.name.is_file:
-            path = Path(self.name.device)
-            container, _ = read_container_tags(path, find_streams(path)[0])
-        display = Display(str(self.name), 1.0, _LIVE_SIDE, container)
         began: float | None = None
         size: tuple[int, int] | None = None
         with contextlib.suppress(av.error.FFmpegError, OSError), source:
-            for due, frame in frames:
+            for due, make in frames:
                 now = self._clock()
+                began = now - due if began is None else began
                 if self.name.is_file:
-                    began = now - due if began is None else began
                     self._wait(self._stopping, max(0.0, began + due - now))
                     now = max(now, began + due)
                 if self._stopping.is_set():
                     return
-                picture = display.show(frame)
+                picture = make()
                 size = size or (picture.shape[1], picture.shape[0])
                 if not has_shape(picture, size):
                     raise UserError(
                         f"{self.name}: the picture changes from {size[0]}x{size[1]} to {picture.shape[1]}x"
-                        f"{picture.shape[0]} at {due:.1f} s; start again with what comes after"
+                        f"{picture.shape[0]} at {now - began:.1f} s; start again with what comes after"
                     )
                 self._keep(LiveFrame(self.frames, now, np.ascontiguousarray(brought_to(picture, size))))
 
@@ -177,19 +175,11 @@ class LiveCamera:
             self._changed.notify_all()
 
 
-@contextlib.contextmanager
-def _file(path: Path) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
-    with open_video(path) as (container, stream):
-        fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
-        yield _timed(container, stream, fps)
-
-
-@contextlib.contextmanager
-def _device(name: CameraName) -> Iterator[Iterator[tuple[float, av.VideoFrame]]]:
-    with _open_device(name) as container:
-        if not container.streams.video:
-            raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
-        yield _timed(container, container.streams.video[0], DEFAULT_FPS)
+def _device_frames(container: InputContainer, name: CameraName) -> _Frames:
+    if not container.streams.video:
+        raise UserError(f"--by {name}: has no pictures; {_remedy(name)}")
+    display = Display(str(name), longest_side=_LIVE_SIDE)
+    return ((0.0, partial(display.show, frame)) for frame in container.decode(container.streams.video[0]))
 
 
 def _open_device(name: CameraName) -> InputContainer:
@@ -211,17 +201,3 @@ def _open_device(name: CameraName) -> InputContainer:
 
 def _remedy(name: CameraName) -> str:
     return "check the address, and that it can be reached from here" if name.is_stream else remedy()
-
-
-def _timed(container: InputContainer, stream: VideoStream, fps: float) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Frames with their times in seconds from the first one."""
-    first: float | None = None
-    latest = -1 / fps
-    for frame in container.decode(stream):
-        seconds = latest + 1 / fps
-        if frame.pts is not None and frame.time_base is not None:
-            absolute = float(frame.pts * frame.time_base)
-            first = absolute if first is None else first
-            seconds = max(absolute - first, latest)
-        latest = seconds
-        yield seconds, frame

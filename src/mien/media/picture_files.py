@@ -37,12 +37,10 @@ class PictureMap(np.memmap):
     """The bytes that the map and all of its views have handed out, as one number."""
 
     def __array_finalize__(self, obj: Any) -> None:
-        """Let views share the count of the array that they view."""
         super().__array_finalize__(obj)
         self._handed_out = getattr(obj, "_handed_out", None)
 
     def __getitem__(self, index: Any) -> Any:
-        """Index the map, and count the bytes that are handed out."""
         found = super().__getitem__(index)
         if isinstance(found, np.ndarray) and self._handed_out is not None:
             self._handed_out[0] += found.nbytes

@@ -2,7 +2,7 @@
 
 import contextlib
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -133,7 +133,7 @@ def read_video_frames(path: Path, longest_side: int = 0) -> Iterator[tuple[float
 
 def read_lazily(
     path: Path, longest_side: int = 0, mode: Deinterlace = "auto", wanted: int | None = None
-) -> Iterator[LazyFrame]:
+) -> Generator[LazyFrame, None, None]:
     """Yield frames as `read_video_frames` does, but convert only pictures that are requested."""
     with open_video(path, wanted) as (container, stream):
         stream.thread_type = "AUTO"
@@ -197,53 +197,44 @@ def encode(
     first = next(iterator, None)
     if first is None:
         raise UserError(f"{path}: no frames to write; check the selection of frames")
-    everything = itertools.chain([first], iterator)
-    write_atomically(path, lambda aside: _encode(aside, everything, first.shape, fps, codec, options, sound))
-
-
-def _encode(
-    path: Path,
-    frames: Iterable[np.ndarray],
-    shape: tuple[int, ...],
-    fps: int | float,
-    codec: str,
-    options: dict[str, str],
-    sound: tuple[Path, float] | None,
-) -> None:
-    height, width, channels = shape
+    height, width, channels = first.shape
     is_h264 = codec == "libx264"
-    with create_video(path) as container:
-        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
-        assert isinstance(stream, VideoStream)
-        stream.width, stream.height = width + width % 2, height + height % 2
-        stream.pix_fmt = "yuva420p" if channels == 4 else "yuv420p"
-        context = stream.codec_context
-        if is_h264:
-            context.thread_count = _THREADS
-        # Players assume BT.709 for matrix, primaries and transfer, and studio range. The file also says so.
-        context.colorspace = context.color_primaries = context.color_trc = 1
-        context.color_range = ColorRange.MPEG
-        packets = _add_sound(container, *sound) if sound is not None else iter(())
-        heard = next(packets, None)
-        reformatter = VideoReformatter()
-        for number, image in enumerate(frames):
-            # Sound goes into the file just before the pictures of its time.
-            while heard is not None and float((heard.pts or 0) * (heard.time_base or 0)) <= number / fps:
-                container.mux(heard)
-                heard = next(packets, None)
-            assert image.shape == shape, f"frames of {shape}, then one of {image.shape}"
-            assert image.dtype == np.uint8, image.dtype
-            even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            frame = reformatter.reformat(
-                av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgba" if channels == 4 else "rgb24"),
-                format=stream.pix_fmt,
-                dst_colorspace=Colorspace.ITU709,
-                dst_color_range=ColorRange.MPEG,
-                interpolation=ACCURATE if is_h264 else None,
-            )
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-        container.mux([packet for packet in (heard, *packets) if packet is not None])
+
+    def write(aside: Path) -> None:
+        with create_video(aside) as container:
+            stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
+            assert isinstance(stream, VideoStream)
+            stream.width, stream.height = width + width % 2, height + height % 2
+            stream.pix_fmt = "yuva420p" if channels == 4 else "yuv420p"
+            context = stream.codec_context
+            if is_h264:
+                context.thread_count = _THREADS
+            # Players assume BT.709 for matrix, primaries and transfer, and studio range. The file also says so.
+            context.colorspace = context.color_primaries = context.color_trc = 1
+            context.color_range = ColorRange.MPEG
+            packets = _add_sound(container, *sound) if sound is not None else iter(())
+            heard = next(packets, None)
+            reformatter = VideoReformatter()
+            for number, image in enumerate(itertools.chain([first], iterator)):
+                # Sound goes into the file just before the pictures of its time.
+                while heard is not None and float((heard.pts or 0) * (heard.time_base or 0)) <= number / fps:
+                    container.mux(heard)
+                    heard = next(packets, None)
+                assert image.shape == first.shape, f"frames of {first.shape}, then one of {image.shape}"
+                assert image.dtype == np.uint8, image.dtype
+                even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                frame = reformatter.reformat(
+                    av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgba" if channels == 4 else "rgb24"),
+                    format=stream.pix_fmt,
+                    dst_colorspace=Colorspace.ITU709,
+                    dst_color_range=ColorRange.MPEG,
+                    interpolation=ACCURATE if is_h264 else None,
+                )
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+            container.mux([packet for packet in (heard, *packets) if packet is not None])
+
+    write_atomically(path, write)
 
 
 def _decoder(stream: VideoStream) -> Callable[[av.Packet], list[av.VideoFrame]]:

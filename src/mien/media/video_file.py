@@ -16,7 +16,6 @@ from typing import IO, Any, TypeVar
 
 import av
 import av.error
-import av.logging
 from av.audio.stream import AudioStream
 from av.container import InputContainer, OutputContainer
 from av.stream import Disposition
@@ -37,15 +36,11 @@ _CONTAINERS = (
 )  # fmt: skip
 """FFmpeg's names of the containers that are accepted. None of them refers to other files. Files with only sound are
 accepted too, so that the message can say that they have no video."""
-_LISTS = (
-    (rb"\A(\xef\xbb\xbf)?\s*#EXTM3U", "a playlist (.m3u8)"),
-    (rb"\Affconcat version", "a list of files for FFmpeg (concat)"),
-    (rb"<MPD[\s>]", "a DASH manifest (.mpd)"),
-    (rb"<SmoothStreamingMedia|<CompositionPlaylist|<AssetMap", "a manifest that names other files"),
-    (rb"\Av=0\r?\n(?s:.*)\nm=", "the description of a stream (.sdp)"),
-    (rb"\A\[InternetShortcut\]|\A\[playlist\]|\A<asx", "a link or a playlist"),
+_LIST = re.compile(
+    rb"\A(\xef\xbb\xbf)?\s*#EXTM3U|\Affconcat version|<MPD[\s>]|<SmoothStreamingMedia|<CompositionPlaylist|<AssetMap"
+    rb"|\Av=0\r?\n(?s:.*)\nm=|\A\[InternetShortcut\]|\A\[playlist\]|\A<asx"
 )
-"""Beginnings of files that name other files or addresses instead of holding pictures, and their descriptions."""
+"""Beginnings of files that name other files or addresses instead of holding pictures."""
 _ANY_TITLE: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 """Titles may have any encoding. PyAV 19 takes them as they are and no longer has the argument."""
 _STILLS = Disposition.timed_thumbnails | Disposition.still_image
@@ -167,9 +162,8 @@ def _why_not(path: Path, error: av.error.FFmpegError | OSError, kind: str) -> st
     """Return what a file that FFmpeg refused is, as far as its beginning shows, and what to do."""
     with path.open("rb") as file:
         start = file.read(4096)
-    for pattern, listed in _LISTS:
-        if re.search(pattern, start):
-            return f"is {listed}, which names other files; mien opens none of those: give the video itself"
+    if _LIST.search(start):
+        return "is a playlist, a manifest or a link, which names other files; mien opens none: give the video itself"
     if isinstance(error, av.error.ArgumentError):
         return "is a file of a kind that mien does not open; convert it to .mp4 or .mov"
     if kind == "sound":
@@ -200,8 +194,7 @@ def _known_pictures(path: Path, container: InputContainer) -> list[VideoStream]:
     # PyAV has no codec context for a codec that FFmpeg does not have.
     known = [stream for stream in moving if stream.codec_context is not None]
     if not known:
-        codec = _codec_name(container, moving[0].index)
-        raise UserError(f"{path}: FFmpeg does not know its codec ({codec}); convert it to H.264")
+        raise UserError(f"{path}: FFmpeg does not know its codec; convert it to H.264")
     return known
 
 
@@ -230,15 +223,3 @@ def _count_packets(path: Path, indices: list[int]) -> Counter[int]:
             if all(counts[index] > 1 for index in indices):
                 break
     return counts
-
-
-def _codec_name(container: InputContainer, index: int) -> str:
-    """Return the codec's name from FFmpeg's description, since PyAV gives none if there is no decoder."""
-    level = av.logging.get_level()
-    av.logging.set_level(av.logging.INFO)
-    try:
-        described: str = container.dumps_format()  # pyright: ignore[reportAttributeAccessIssue]
-    finally:
-        av.logging.set_level(level)
-    match = re.search(rf"Stream #\d+:{index}\b[^\n]*?: Video: (?:none \()?([^,\n]+?)(?: / 0x\w+\))?[,\n]", described)
-    return match.group(1) if match else "it has no name"

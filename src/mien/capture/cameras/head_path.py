@@ -8,7 +8,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mien.camera import Camera
-from mien.capture.person.crop import CROP_LEAST_HEAD_SHARE, CROP_MOST_ASPECT, CROP_OUTLIERS, Crop, whole_picture
+from mien.capture.person.crop import (
+    CROP_LEAST_HEAD_SHARE,
+    CROP_MOST_ASPECT,
+    CROP_OUTLIERS,
+    Crop,
+    crop_around,
+    whole_picture,
+)
 from mien.errors import UserError
 
 _HEAD_RADIUS = 0.24
@@ -66,14 +73,24 @@ def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> H
         best[better], best_cost[better] = points[better], cost[better]
     agrees = _misses(best, centers, sides, cameras) < _HEAD_MOST_MISS
     agrees[agrees.sum(axis=1) < 2] = False
-    refined = np.full_like(best, np.nan)
-    for timestep in np.flatnonzero(agrees.any(axis=1)):
-        # The point with the least sum of squared distances to the rays of the cameras that agree.
-        chosen = agrees[timestep]
-        rays = directions[timestep, chosen]
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        refined[timestep] = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, origins[chosen]))
+    refined = triangulate(centers[:, :, None], agrees, cameras)[:, 0]
     return HeadPath(refined, agrees)
+
+
+def triangulate(
+    pixels: Float[np.ndarray, "t c p 2"], agrees: Bool[np.ndarray, "t c"], cameras: Sequence[Camera]
+) -> Float[np.ndarray, "t p 3"]:
+    """Return the points nearest to the rays of the cameras that agree; NaN where there are no such cameras.
+
+    They have the least sum of squared distances to these rays.
+    """
+    directions = np.stack([rays_of(pixels[:, :, index], cameras) for index in range(pixels.shape[2])], axis=2)
+    origins = np.stack([camera.position.numpy() for camera in cameras]).astype(np.float64)
+    across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
+    across = np.where(agrees[:, :, None, None, None], across, 0)
+    summed = across.sum(axis=1)
+    summed[~agrees.any(axis=1)] = np.nan
+    return np.linalg.solve(summed, np.einsum("tcpij,cj->tpi", across, origins)[..., None])[..., 0]
 
 
 def _sides(boxes: Float[np.ndarray, "t c 4"]) -> Float[np.ndarray, "t c"]:
@@ -107,11 +124,10 @@ def choose_crops(
         return [crop] * len(cameras), (crop.width, crop.height)
     cuts = [min(round(side), camera.width, camera.height) for side, camera in zip(sides, cameras, strict=True)]
     output = min(size, *cuts)
-    crops = []
-    for span, cut, camera in zip(spans, cuts, cameras, strict=True):
-        left = int(np.clip(round((span[0] + span[2] - cut) / 2), 0, camera.width - cut))
-        top = int(np.clip(round((span[1] + span[3] - cut) / 2), 0, camera.height - cut))
-        crops.append(Crop(left, top, cut, cut, output, output))
+    crops = [
+        crop_around(span, cut, camera.width, camera.height, output)
+        for span, cut, camera in zip(spans, cuts, cameras, strict=True)
+    ]
     return crops, (output, output)
 
 
@@ -164,7 +180,6 @@ def _misses(
     sides: Float[np.ndarray, "t c"],
     cameras: Sequence[Camera],
 ) -> Float[np.ndarray, "t c"]:
-    """Distance of the projected point from each found face, in sides of its box; infinite where there is none."""
     projected = np.stack([project(points, camera) for camera in cameras], axis=1)
     with np.errstate(invalid="ignore"):
         misses = np.linalg.norm(projected - centers, axis=-1) / sides

@@ -14,10 +14,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.capture.cameras.calibration import CalibratedCamera
-from mien.capture.cameras.head_path import consensus, project, rays_of
+from mien.capture.cameras.head_path import consensus, project, triangulate
 from mien.capture.person.backend import DetectorChoice
-from mien.capture.person.crop import Crop
+from mien.capture.person.crop import crop_around
 from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.machine.progress import say
 from mien.media.source import FrameSource
@@ -210,8 +209,8 @@ def _fit(landmarks: Float[np.ndarray, "t c l 2"], boxes: Float[np.ndarray, "t c 
     agrees, cameras = consensus(boxes, reading.cameras).agrees, reading.cameras
     if not len(landmarks) or agrees.sum() < 0.5 * np.isfinite(boxes[..., 0]).sum():
         return Ranked(reading, np.inf, np.inf)
-    points = _places(landmarks[:, :, list(_POINTS)], agrees, cameras)
-    around = _places(landmarks[:, :, [_NOSE, *_AROUND]], agrees, cameras)
+    points = triangulate(landmarks[:, :, list(_POINTS)], agrees, cameras)
+    around = triangulate(landmarks[:, :, [_NOSE, *_AROUND]], agrees, cameras)
     missed = np.stack([project(points, camera) for camera in cameras], axis=1) - landmarks[:, :, list(_POINTS)]
     distances = np.linalg.norm(missed[agrees], axis=-1)
     distances[~np.isfinite(distances)] = np.inf
@@ -219,19 +218,6 @@ def _fit(landmarks: Float[np.ndarray, "t c l 2"], boxes: Float[np.ndarray, "t c 
     if _height(around, agrees, cameras) < INSIDE_OUT:
         return Ranked(reading, np.inf, np.inf)
     return Ranked(reading, float(np.median(distances)), float(np.median(distances / sides[:, None])))
-
-
-def _places(
-    pixels: Float[np.ndarray, "t c p 2"], agrees: Bool[np.ndarray, "t c"], cameras: Sequence[Camera]
-) -> Float[np.ndarray, "t p 3"]:
-    """Return the points nearest to the rays of the cameras that agree; NaN where there are no such cameras."""
-    directions = np.stack([rays_of(pixels[:, :, index], cameras) for index in range(pixels.shape[2])], axis=2)
-    origins = np.stack([camera.position.numpy() for camera in cameras]).astype(np.float64)
-    across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
-    across = np.where(agrees[:, :, None, None, None], across, 0)
-    summed = across.sum(axis=1)
-    summed[~agrees.any(axis=1)] = np.nan
-    return np.linalg.solve(summed, np.einsum("tcpij,cj->tpi", across, origins)[..., None])[..., 0]
 
 
 def _height(points: Float[np.ndarray, "t p 3"], agrees: Bool[np.ndarray, "t c"], cameras: Sequence[Camera]) -> float:
@@ -242,26 +228,15 @@ def _height(points: Float[np.ndarray, "t p 3"], agrees: Bool[np.ndarray, "t c"],
     return float(np.median(heights[agrees]))
 
 
-Fitted = Callable[[int, CalibratedCamera], Camera]
-"""Makes the camera for the pictures in which landmarks are measured, of the camera with that index."""
-
-
-def advise_on(cameras: Sequence[CalibratedCamera], fitted: Fitted, landmarks: Float[np.ndarray, "t c l 2"]) -> str:
-    """Return what to correct in a calibration, or an empty text if it fits as it is written, or no reading fits."""
-    ranked = rank_readings(landmarks, _readings(cameras, fitted))
-    return advice_of(ranked) if is_wrong(ranked) else ""
-
-
-def warn_of_misfit(
-    cameras: Sequence[CalibratedCamera], fitted: Fitted, landmarks: Float[np.ndarray, "t c l 2"]
-) -> None:
+def warn_of_misfit(ranked: Sequence[Ranked]) -> None:
     """Warn if the landmarks of a finished capture fit another reading of its calibration far better."""
-    ranked = rank_readings(landmarks, _readings(cameras, fitted))
     if is_wrong(ranked):
         pixels = written_of(ranked).pixels
         apart = f"within {pixels:.1f} px" if np.isfinite(pixels) else "nowhere, or on a face that is inside out"
-        say(f"warning: --calibration: as it is written, the cameras agree on points of the face {apart}; "
-            f"{advice_of(ranked)}; then capture again")  # fmt: skip
+        say(
+            f"warning: --calibration: as it is written, the cameras agree on points of the face {apart}; "
+            f"{advice_of(ranked)}; then capture again"
+        )
 
 
 def some_timesteps(found: Bool[np.ndarray, "t c"]) -> list[int]:
@@ -285,25 +260,9 @@ def landmarks_at(
         for timestep, frame in enumerate(itertools.islice(frames.frames(), max(places) + 1)):
             if timestep in places:
                 picture = frame.picture()
-                crop = _around(boxes[timestep], picture.shape[1], picture.shape[0])
+                height, width = picture.shape[:2]
+                side = max(round(2.0 * float((boxes[timestep, 2:] - boxes[timestep, :2]).max())), 256)
+                crop = crop_around(boxes[timestep], side, width, height, side)
                 for face in finder.detect(crop.apply(picture))[:1]:
                     found[places[timestep]] = face + (crop.left, crop.top)
     return found
-
-
-def _around(box: Float[np.ndarray, " 4"], width: int, height: int) -> Crop:
-    side = max(2.0 * float((box[2:] - box[:2]).max()), 256)
-    cut_width, cut_height = min(round(side), width), min(round(side), height)
-    left = int(np.clip(round((box[0] + box[2] - cut_width) / 2), 0, width - cut_width))
-    top = int(np.clip(round((box[1] + box[3] - cut_height) / 2), 0, height - cut_height))
-    return Crop(left, top, cut_width, cut_height, cut_width, cut_height)
-
-
-def _readings(cameras: Sequence[CalibratedCamera], fitted: Fitted) -> list[Reading]:
-    return [
-        Reading(reading.remedies, tuple(
-            fitted(index, CalibratedCamera(camera.camera_id, read))
-            for index, (camera, read) in enumerate(zip(cameras, reading.cameras, strict=True))
-        ))
-        for reading in readings_of([camera.camera for camera in cameras])
-    ]  # fmt: skip

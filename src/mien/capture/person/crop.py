@@ -68,6 +68,12 @@ def choose_crop(boxes: Float[np.ndarray, "t 4"], width: int, height: int, size: 
     if longer <= CROP_MOST_ASPECT * shorter and wanted >= CROP_LEAST_HEAD_SHARE * shorter:
         return whole_picture(width, height, size)
     side = min(round(wanted), shorter)
-    crop_left = int(np.clip(round((left + right - side) / 2), 0, width - side))
-    crop_top = int(np.clip(round((top + bottom - side) / 2), 0, height - side))
-    return Crop(crop_left, crop_top, side, side, min(side, size), min(side, size))
+    return crop_around(np.array([left, top, right, bottom]), side, width, height, size)
+
+
+def crop_around(box: Float[np.ndarray, " 4"], side: int, width: int, height: int, size: int) -> Crop:
+    """Return a square of `side` pixels about a box, inside a picture of that width and height, shrunk to `size`."""
+    across, down = min(side, width), min(side, height)
+    left = int(np.clip(round((box[0] + box[2] - across) / 2), 0, width - across))
+    top = int(np.clip(round((box[1] + box[3] - down) / 2), 0, height - down))
+    return Crop(left, top, across, down, min(across, size), min(down, size))

@@ -6,6 +6,8 @@ The classes here are seams: behind them, mediapipe or `mien.capture.person.liter
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -53,29 +55,25 @@ def _mediapipe_boxes(stack: ExitStack) -> list[Callable[[np.ndarray], _Boxes]]:
             stack.callback(detector.close)
             detector.process(blank)
 
-    def of(detector: object) -> Callable[[np.ndarray], _Boxes]:
-        def find(image: np.ndarray) -> _Boxes:
-            found = detector.process(image).detections or ()  # pyright: ignore[reportAttributeAccessIssue]
-            boxes = [detection.location_data.relative_bounding_box for detection in found]
-            corners = [(b.xmin, b.ymin, b.xmin + b.width, b.ymin + b.height) for b in boxes]
-            return np.array(corners).reshape(-1, 4), np.array([detection.score[0] for detection in found])
+    return [partial(_found_by_mediapipe, detector) for detector in detectors]
 
-        return find
 
-    return [of(detector) for detector in detectors]
+def _found_by_mediapipe(detector: Any, image: np.ndarray) -> _Boxes:
+    found = detector.process(image).detections or ()
+    boxes = [detection.location_data.relative_bounding_box for detection in found]
+    corners = [(b.xmin, b.ymin, b.xmin + b.width, b.ymin + b.height) for b in boxes]
+    return np.array(corners).reshape(-1, 4), np.array([detection.score[0] for detection in found])
 
 
 def _litert_boxes() -> list[Callable[[np.ndarray], _Boxes]]:
     from mien.capture.person.litert import BoxNetwork
 
-    def of(network: BoxNetwork) -> Callable[[np.ndarray], _Boxes]:
-        def find(image: np.ndarray) -> _Boxes:
-            found = network.find(image)
-            return found.boxes / np.tile([image.shape[1], image.shape[0]], 2), found.scores
+    def find(network: BoxNetwork, image: np.ndarray) -> _Boxes:
+        found = network.find(image)
+        return found.boxes / np.tile([image.shape[1], image.shape[0]], 2), found.scores
 
-        return find
-
-    return [of(BoxNetwork("near_faces", _FACE_CONFIDENCE)), of(BoxNetwork("far_faces", _FACE_CONFIDENCE))]
+    names = ("near_faces", "far_faces")
+    return [partial(find, BoxNetwork(name, _FACE_CONFIDENCE)) for name in names]
 
 
 class MeshReader(Networks):

@@ -78,7 +78,6 @@ def refine_matte(image: UInt8[np.ndarray, "h w 3"], mask: Float[np.ndarray, "256
 
 
 def _stretch(values: Float[np.ndarray, "h w"], levels: tuple[float, float]) -> Float[np.ndarray, "h w"]:
-    """Map the two levels to 0 and 1, and clip."""
     return np.clip((values - levels[0]) / (levels[1] - levels[0]), 0, 1)
 
 

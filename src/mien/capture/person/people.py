@@ -65,7 +65,7 @@ def choose_person(survey: Survey) -> Person:
             others[list(frames), list(places)] = np.nan
     if not lasting:
         return Person(boxes, others)
-    areas = np.square(_sizes(survey.boxes))
+    areas = np.maximum(np.prod(survey.boxes[..., 2:] - survey.boxes[..., :2], axis=-1), 1e-12)
     lasting.sort(key=lambda track: -_weight([track], areas))
     people = [
         _gather(track, lasting, areas, survey.colors) for track in lasting[:8]
@@ -76,11 +76,6 @@ def choose_person(survey: Survey) -> Person:
             boxes[frame] = survey.boxes[frame, place]
             others[frame, place] = np.nan
     return Person(boxes, others)
-
-
-def _sizes(boxes: Float[np.ndarray, "t f 4"]) -> Float[np.ndarray, "t f"]:
-    """Mean side of each face, as a fraction of the picture."""
-    return np.sqrt(np.maximum((boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1]), 1e-12))
 
 
 def _link(survey: Survey) -> list[_Track]:
@@ -124,7 +119,6 @@ def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> 
 
 
 def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:
-    """Area of the person's face, summed over the frames."""
     return float(sum(areas[entry] for track in tracks for entry in track))
 
 

@@ -60,7 +60,6 @@ def plate_matte(
 
 
 def _grow(mask: Bool[np.ndarray, "h w"], distance: float) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels within `distance` of the mask."""
     if not mask.any():
         return mask
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3) <= distance
@@ -187,7 +186,6 @@ def without_screen(
 
 
 def _tint(color: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """Return what a colour has beyond grey."""
     return (color - color.mean()).astype(np.float32)
 
 

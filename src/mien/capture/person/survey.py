@@ -5,11 +5,11 @@ It also finds out whether the video lies on its side, and explains why no face w
 
 import contextlib
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ _CUT_THUMBNAIL = (32, 18)
 _PERSON_COLOR_CELLS = 3  # cells along each side of the grid on which a face's mean colours are computed
 _SURVEY_SIDE = 512  # longest side in pixels of the pictures in which faces are searched
 
+_Saved = TypeVar("_Saved")
 _CHUNK = 1000  # frames after which progress is saved
 _MAX_TURNED = 8  # most pictures that are turned each way...
 _BEGINNING = 500  # ...taken from this many at the beginning, preferably with a face
@@ -85,61 +86,52 @@ def survey_source(
     work.mkdir(parents=True, exist_ok=True)
     whole, done = work / "survey.safetensors", []
     if whole.is_file():
-        return _read(whole)
+        return read_saved(whole, Survey)
     for path in itertools.takewhile(Path.exists, (_chunk_path(work, index) for index in itertools.count())):
-        done.append(_read(path))
+        done.append(read_saved(path, Survey))
     stream = itertools.islice(frames.frames(_SURVEY_SIDE), len(done) * _CHUNK, None)
     title = f"find the face in {frames.path.name}"
+    finder = FaceFinder(detector)
     with ExitStack() as stack:
-        finder = stack.enter_context(FaceFinder(detector)) if landmarks is None else None
-
-        def find(frame: LazyFrame, image: np.ndarray) -> np.ndarray:
-            if finder is not None:
-                return finder.find(image)
-            assert landmarks is not None
-            return _boxes_of(landmarks, frame)
-
+        if landmarks is None:
+            stack.enter_context(finder)
         advance = stack.enter_context(progress_bar(title, frames.expected_frames, len(done) * _CHUNK))
-        while seen := _observe(itertools.islice(stream, _CHUNK), find, advance):
+        while seen := _observe(itertools.islice(stream, _CHUNK), finder, landmarks, advance):
             write_arrays(_chunk_path(work, len(done)), vars(seen))
             done.append(seen)
-    names = [field.name for field in fields(Survey)]
-    survey = Survey(**{name: np.concatenate([getattr(chunk, name) for chunk in done]) for name in names})
+    survey = Survey(**{name: np.concatenate([vars(chunk)[name] for chunk in done]) for name in vars(done[0])})
     write_arrays(whole, vars(survey))
     for index in range(len(done)):
         _chunk_path(work, index).unlink()
     return survey
 
 
-def _read(path: Path) -> Survey:
-    """Read the saved results of an earlier call."""
+def read_saved(path: Path, kind: type[_Saved]) -> _Saved:
+    """Read arrays that an interrupted call saved as the fields of a class."""
     arrays = read_arrays(path)
     with expect_whole(path, "delete its folder and run `mien capture` again"):
-        return Survey(**arrays)
+        return kind(**arrays)
 
 
 def slice_survey(survey: Survey, span: slice) -> Survey:
     """Return some consecutive frames. Their times still count from the start of the whole."""
-    return Survey(**{field.name: getattr(survey, field.name)[span] for field in fields(survey)})
-
-
-_Find = Callable[[LazyFrame, np.ndarray], np.ndarray]
-"""Returns the boxes [n, 4] of the faces in a frame, given the frame and its picture."""
+    return Survey(**{name: values[span] for name, values in vars(survey).items()})
 
 
 def _boxes_of(landmarks: Float[np.ndarray, "n l 2"], frame: LazyFrame) -> Float[np.ndarray, "n 4"]:
-    """Return the box around landmarks that are given in pixels, or none."""
     face = landmarks[frame.number] / frame.size()
     box = np.concatenate([face.min(axis=0), face.max(axis=0)])
     return box[None] if np.isfinite(face).all() else np.zeros((0, 4))
 
 
-def _observe(stream: Iterator[LazyFrame], find: _Find, advance: Advance) -> Survey | None:
+def _observe(
+    stream: Iterator[LazyFrame], finder: FaceFinder, landmarks: Float[np.ndarray, "n l 2"] | None, advance: Advance
+) -> Survey | None:
     """Survey the frames of a stream; None if it is at its end."""
     rows: list[tuple[Any, ...]] = []
     for frame in stream:
         image = frame.picture()
-        found = find(frame, image)
+        found = finder.find(image) if landmarks is None else _boxes_of(landmarks, frame)
         largest = np.argsort(-np.prod(found[:, 2:] - found[:, :2], axis=1))[:MAX_FACES]
         boxes = np.full((MAX_FACES, 4), np.nan)
         boxes[: len(largest)] = found[largest]
@@ -156,7 +148,6 @@ def _observe(stream: Iterator[LazyFrame], find: _Find, advance: Advance) -> Surv
 
 
 def _mean_colors(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " p"]:
-    """Return the mean colours of a face; NaN for no face."""
     cells = _PERSON_COLOR_CELLS
     if not np.isfinite(box).all():
         return np.full(3 * cells**2, np.nan)

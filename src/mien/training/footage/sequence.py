@@ -17,8 +17,8 @@ from mien.capture.capture import Capture
 from mien.capture.store import read_capture, read_capture_hash
 from mien.disk.locks import read_beside_writers
 from mien.errors import UserError
+from mien.face.head_parts import part_boxes
 from mien.face.model import FaceModel
-from mien.face.parts import part_boxes
 from mien.tracking.files import check_tracking_of, read_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import read_scoring
