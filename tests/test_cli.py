@@ -234,7 +234,7 @@ ODD = [
     ("evaluate W --perceptual-frames -1", "--perceptual-frames -1"),
     ("train W --run a/b", "'a/b' cannot be the name of a folder"),
     ("track W --face-model none", "no face model 'none'"),
-    ("track W --tracking.paper.offset-sigma nan", "--tracking.paper.offset-sigma nan: give a number from 0 to 1e+09"),
+    ("track W --tracking.photometric.lids nan", "--tracking.photometric.lids nan: give a number from 0 to 1e+09"),
     ("track W --scoring.cut line", "give --scoring.cut plane, or delete that folder"),
     ("capture empty.mp4 --out text.txt", "is a file, but a folder"),
     ("capture /dev/null --out new", "/dev/null: is not a file"),

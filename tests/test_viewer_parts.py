@@ -21,9 +21,9 @@ from forked import ForkServer
 from known import known
 from mien import runtime
 from mien.avatar.baking import make_portable
-from mien.pipeline import live_view
 from mien.pipeline import view as viewing
-from mien.pipeline.live_view import LiveView
+from mien.pipeline import view_training
+from mien.pipeline.view_training import TrainingView
 from mien.training import train
 from mien.viewer.access import Door, is_loopback
 from mien.viewer.drawing import View
@@ -223,15 +223,15 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         files.append(file)
         return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
 
-    monkeypatch.setattr(live_view, "start_viewer", start)
+    monkeypatch.setattr(view_training, "start_viewer", start)
     return files
 
 
 def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """What cannot be shown is said once."""
     now = [100.0]
-    monkeypatch.setattr(live_view.time, "monotonic", lambda: now[0])
-    avatar, live = new_avatar("gaussian_avatars"), LiveView("toy", toy_camera(32))
+    monkeypatch.setattr(view_training.time, "monotonic", lambda: now[0])
+    avatar, live = new_avatar("gaussian_avatars"), TrainingView("toy", toy_camera(32))
     live(avatar)
     (file,) = started
     first = file.read_bytes()
@@ -243,7 +243,7 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
         assert (file.read_bytes() == first) is same
     live.close()
     assert not file.parent.exists()
-    other = LiveView("toy", toy_camera(32))
+    other = TrainingView("toy", toy_camera(32))
     for _ in range(3):
         other(new_avatar("headgas", variant="delta"))
     other.close()
@@ -254,9 +254,9 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
 
 
 def test_a_watched_training_has_the_same_bytes(started: list[Path], tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(live_view, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(view_training, "LEAST_SECONDS", 0.0)
     face_model, sequence = toy_sequence(5, 32)
-    live, seen, settings = LiveView("toy", toy_camera(32)), [], replace(train_toy.SETTINGS, steps=12)
+    live, seen, settings = TrainingView("toy", toy_camera(32)), [], replace(train_toy.SETTINGS, steps=12)
     for name, watch in (("plain", None), ("watched", lambda avatar: seen.append(live(avatar)))):
         train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / name, watch=watch)
     live.close()
@@ -279,13 +279,13 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             runtime.write_portable(file, make_portable(avatar, toy_camera(32), "toy"))
         if turn == 4:
             assert session.avatar is not before
-            monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
+            monkeypatch.setenv(view_training.PARENT_VARIABLE, "1")
 
     monkeypatch.setattr(viewing.time, "sleep", sleep)
     monkeypatch.setattr(viewing.os, "kill", lambda process, number: signals.append((process, number)))
-    monkeypatch.setenv(live_view.PARENT_VARIABLE, str(os.getppid()))
+    monkeypatch.setenv(view_training.PARENT_VARIABLE, str(os.getppid()))
     pytest.raises(StopIteration, viewing.follow_file, session, file)
-    monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
+    monkeypatch.setenv(view_training.PARENT_VARIABLE, "1")
     monkeypatch.setattr(viewing.time, "sleep", lambda _: None)
     viewing.follow_file(session, file)
     assert signals == [(os.getpid(), signal.SIGTERM)]
@@ -294,7 +294,7 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def watched_training(folder: str) -> None:
     face_model, sequence = toy_sequence(5, 32)
-    live, settings = LiveView("toy", toy_camera(32)), replace(train_toy.SETTINGS, steps=1_000_000)
+    live, settings = TrainingView("toy", toy_camera(32)), replace(train_toy.SETTINGS, steps=1_000_000)
     try:
         train([sequence], face_model, train_toy.CONFIG, settings, Path(folder), watch=live)
     finally:

@@ -90,7 +90,7 @@ class Options:
     store: str = ""
     """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
     program: tuple[str, ...] = ()
-    """The command of a row's process. Empty means this Python with `-m mien.commands.batch_row`."""
+    """The command of a row's process. Empty means `mien batch-row`, by this Python."""
 
 
 Work = Callable[[Row], Any]

@@ -32,7 +32,7 @@ from mien.machine.terminal import printable, tell
 
 Do = Callable[[Batch, Row], tuple[tuple[dict[str, Any], ...], dict[str, float]]]
 """Runs the steps of a row, and returns the figures of its runs and the seconds of its stages."""
-PROGRAM = (sys.executable, "-m", "mien.commands.batch_row")
+PROGRAM = (sys.executable, "-m", "mien.cli", "batch-row")
 """The command of a row's process."""
 EXIT_BUSY = 75
 """Exit code of a row's process if another process holds the row."""

@@ -56,8 +56,8 @@ class Run:
     store: str = ""
     """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
     program: str = ""
-    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.commands.batch_row". The
-    folder of the batch follows it."""
+    """Command that runs a row on a node, such as "apptainer exec mien.sif mien batch-row". The folder of
+    the batch follows it."""
     for_all: Annotated[tuple[str, ...], tyro.conf.Fixed, tyro.conf.Suppress] = ()
     """Options of `mien create`."""
 

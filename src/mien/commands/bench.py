@@ -218,12 +218,13 @@ class Compare:
 
     def run(self) -> None:
         """Train and score every method on every capture, then print the table."""
-        from mien.pipeline.comparing import Budget, CompareSettings, run_compare_stage
+        from mien.pipeline.comparing import run_compare_stage
 
-        methods = tuple(dict.fromkeys(self.methods))
-        settings = CompareSettings(methods, Budget(self.minutes, self.steps), self.split)
-        opened = [open_workspace(folder) for folder in self.workspaces]
-        run_compare_stage(self.out, opened, self.captures, settings, as_json=self.as_json)
+        run_compare_stage(
+            self.out, [open_workspace(folder) for folder in self.workspaces], self.captures,
+            list(dict.fromkeys(self.methods)), minutes=self.minutes, steps=self.steps, split=self.split,
+            as_json=self.as_json,
+        )  # fmt: skip
 
 
 TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}

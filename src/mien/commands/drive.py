@@ -106,10 +106,12 @@ class Show(_Neutral, _Drive):
 
     def run(self) -> None:
         """Show the avatar until Ctrl-C."""
-        from mien.pipeline.view import Motions, Place, run_viewing_stage
+        from mien.pipeline.view import run_viewing_stage
 
-        motions = Motions(self.by, self.neutral, at_once=True, capture=self.capture)
-        run_viewing_stage(self.workspace, self.run_name, motions, Place("127.0.0.1", self.port))
+        run_viewing_stage(
+            self.workspace, self.run_name, play=self.by, neutral=self.neutral, capture=self.capture, at_once=True,
+            port=self.port,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,13 +140,11 @@ class Follow(_Film, _Drive):
     def run(self) -> None:
         """Follow until Ctrl-C, or until the file of a camera ends."""
         from mien.driving.follower import FollowOptions
-        from mien.pipeline.follow import CameraOptions, run_following_stage
-        from mien.pipeline.view import Place
+        from mien.pipeline.follow import run_following_stage
 
-        place = Place("127.0.0.1", self.port) if has_viewer() else None
-        follow = FollowOptions(self.head_pose, self.unlimited)
-        options = CameraOptions(follow, self.picture, self.out, self.alone, place)
-        run_following_stage(self.workspace, self.run_name, camera_named(self.by, self.camera_format), options)
+        camera, follow = camera_named(self.by, self.camera_format), FollowOptions(self.head_pose, self.unlimited)
+        port = self.port if has_viewer() else None
+        run_following_stage(self.workspace, self.run_name, camera, follow, self.picture, self.out, self.alone, port)
 
 
 def task_of(arguments: Sequence[str]) -> type:

@@ -5,7 +5,7 @@ import contextlib
 import inspect
 import io
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
 from types import FunctionType, ModuleType
@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import tyro
 
 from mien.commands.train_options import TrainOptions
-from mien.disk.config import Range, range_of, shown
+from mien.disk.config import Range, shown
 from mien.errors import UserError
 from mien.machine.terminal import show
 
@@ -138,30 +138,50 @@ def explained(
         presets: The same options by each preset.
     """
     kind = type(options)
-    hints, about, annotations, defaults = get_type_hints(kind, include_extras=True), field_docs(kind), {}, {}
-    for one in fields(kind):
-        value, hint = getattr(options, one.name), hints[one.name]
-        base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        name = next((mark.name for mark in marks if getattr(mark, "name", None) is not None), None)
-        option = ".".join(filter(None, (prefix, one.name.replace("_", "-") if name is None else name)))
-        others = {preset: getattr(each, one.name) for preset, each in (presets or {}).items()}
+    about, annotations, defaults = field_docs(kind), {}, {}
+    for name, option, base, marks in _named_fields(kind, prefix):
+        value, others = getattr(options, name), {each: getattr(one, name) for each, one in (presets or {}).items()}
+        if tyro.conf.Fixed in marks:
+            annotations[name], defaults[name] = Annotated[(base, *marks)], value
+            continue
         if is_dataclass(value):
             others = value.by_preset() if isinstance(value, TrainOptions) else others
             group = explained(value, is_shown, option, others)
-            annotations[one.name] = Annotated[(group, *marks)] if marks else group
-            defaults[one.name] = field(default_factory=group)
+            annotations[name] = Annotated[(group, *marks)] if marks else group
+            defaults[name] = field(default_factory=group)
             continue
         marks += [] if tyro.conf.Positional in marks or is_shown(option) else [tyro.conf.Suppress]
         listed = [mark() for mark in marks if isinstance(mark, FunctionType)]  # what is registered
-        text = " ".join(" ".join([about.get(one.name, ""), *listed]).split())
+        text = " ".join(" ".join([about.get(name, ""), *listed]).split())
         is_flag = base is bool and not prefix.startswith(("training", "method"))
-        values = partial(_about_value, is_flag or "(default:" in text, range_of(hint), value, others)
-        annotations[one.name] = Annotated[(base, *marks, tyro.conf.arg(help=text, help_behavior_hint=values))]
+        allowed = next((mark for mark in marks if isinstance(mark, Range)), None)
+        values = partial(_about_value, is_flag or "(default:" in text, allowed, value, others)
+        annotations[name] = Annotated[(base, *marks, tyro.conf.arg(help=text, help_behavior_hint=values))]
         if value is not tyro.MISSING:
-            defaults[one.name] = value
+            defaults[name] = value
     # It is a subclass, because tyro finds descriptions of groups in the parent.
     inside = {"__annotations__": annotations, "__doc__": kind.__doc__, "__module__": kind.__module__, **defaults}
     return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), inside))
+
+
+def options_of(options: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The options of a command by their names, such as "capture.size", with their defaults."""
+    for name, option, _, marks in _named_fields(type(options), prefix):
+        value = getattr(options, name)
+        if is_dataclass(value) and tyro.conf.Fixed not in marks:
+            yield from options_of(value, option)
+        elif not {tyro.conf.Fixed, tyro.conf.Positional} & {*marks}:
+            yield option, value
+
+
+def _named_fields(kind: type, prefix: str) -> Iterator[tuple[str, str, Any, list[Any]]]:
+    """The fields of a class of options: name, name of the option, type, and marks beside the type."""
+    hints = get_type_hints(kind, include_extras=True)
+    for one in fields(kind):
+        base, *marks = get_args(hint) if get_origin(hint := hints[one.name]) is Annotated else (hint,)
+        name = next((mark.name for mark in marks if getattr(mark, "name", None) is not None), None)
+        option = ".".join(filter(None, (prefix, one.name.replace("_", "-") if name is None else name)))
+        yield one.name, option, base, marks
 
 
 def _about_value(is_silent: bool, allowed: Range | None, value: Any, others: Mapping[str, Any], default: str) -> str:

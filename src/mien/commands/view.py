@@ -10,8 +10,6 @@ from mien.errors import UserError
 from mien.pipeline.driver import name_driver, name_neutral
 from mien.pipeline.names import check_avatar, check_port, check_viewer
 
-_LOOPBACK = "127.0.0.1"
-
 
 @dataclass(frozen=True)
 class Command:
@@ -30,7 +28,7 @@ class Command:
     """Port of the server, from 1 to 65535. 0 means a free one."""
     follow: bool = False
     """Show the .mien file anew each time it changes."""
-    host: str = _LOOPBACK
+    host: str = "127.0.0.1"
     """Address to listen on (default: this machine alone). 0.0.0.0 stands for all addresses of this machine."""
     token: bool = True
     """By default, browsers need the token in the printed address. With --no-token, every user of this machine can use
@@ -49,7 +47,9 @@ class Command:
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""
-        from mien.pipeline.view import Motions, Place, run_viewing_stage
+        from mien.pipeline.view import run_viewing_stage
 
-        motions = Motions(self.play, self.neutral)
-        run_viewing_stage(self.avatar, self.run_name, motions, Place(self.host, self.port, self.token), self.follow)
+        run_viewing_stage(
+            self.avatar, self.run_name, play=self.play, neutral=self.neutral, host=self.host, port=self.port,
+            token=self.token, follow=self.follow,
+        )  # fmt: skip

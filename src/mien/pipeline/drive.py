@@ -98,7 +98,7 @@ def tracked_film(
         for index, picture in enumerate(each for each in pictures for _ in range(_FEWEST)):
             content = picture.read_bytes()
             write_atomically(source / f"{index}{picture.suffix}", partial(Path.write_bytes, data=content))
-    run_capture_stage(workspace, source, None, settings)
+    run_capture_stage(workspace, [source], (), None, settings)
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
     tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
     names = sorted(tracked, key=lambda name: (len(name), name))

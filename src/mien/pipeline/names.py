@@ -55,8 +55,12 @@ def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
     return found
 
 
-def check_videos(videos: Sequence[Path]) -> None:
-    """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture."""
+def check_sources(videos: Sequence[Path], names: Sequence[str], calibration: Path | None) -> None:
+    """Check videos and names before anything heavy is loaded. Folders of pictures are left to the capture."""
+    if calibration is None:
+        sequence_names(videos, names)
+    else:
+        rig_name(videos, calibration, names)
     for video in videos:
         check_no_workspace(video)
         if video.is_file() and is_picture(video):

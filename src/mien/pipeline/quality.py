@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar.methods import method_named
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture, read_capture_hash
 from mien.disk.files import read_json, replace_folder, write_atomically, write_json
@@ -22,7 +21,7 @@ from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import protocol_means, read_metrics
+from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
@@ -54,78 +53,58 @@ from mien.training.run import read_training_summary
 from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 
 _FORMAT, _VERSION = "mien.bench_quality", 1
-_TIMES = "seconds.json"
-_FACE_MODEL = "anny"
 _SHEET_SIDE, _SHEET_FRAMES = 192, 6
-_SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
-_UNSEEN = ScoreSettings(perceptual_frames=2)
+_SCORED, _PRESET = EvaluationSettings(perceptual_frames=8, video_frames=0), PRESETS["standard"]
 
 
 def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
     """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png."""
     usual = [name for name, reference in REFERENCES.items() if reference.by_default]
-    references = [reference_named(name) for name in captures or usual]
-    method_named(method)
+    references, rows, strips = [reference_named(name) for name in captures or usual], [], []
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        rows = _walk(references, out, method, steps)
+        for reference in references:
+            row, strip = _run_reference(reference, out, method, steps or reference.steps)
+            rows.append(row)
+            strips.append(strip)
+            content = {"rows": [asdict(row) for row in rows]}
+            write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
+            write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), "utf-8"))
+            write_png(out / "contact_sheet.png", np.concatenate(strips))
     show(json.dumps([asdict(row) for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
-def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int) -> list[QualityRow]:
-    rows, strips = [], []
-    for reference in references:
-        row, strip = run_reference(reference, out, method, steps or reference.steps)
-        rows.append(row)
-        strips.append(strip)
-        content = {"rows": [asdict(row) for row in rows]}
-        write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
-        write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
-        write_png(out / "contact_sheet.png", np.concatenate(strips))
-    return rows
-
-
-def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
+def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
     """Run all stages on one reference capture and skip those with current results; return its row and its pictures.
 
     Frames of one camera are aligned as `mien create` does.
     """
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
-    times = StageTimes(workspace.root / _TIMES)
+    times = StageTimes(workspace.root / "seconds.json")
     say(f"== {reference.name}: {reference.description}")
     key, trackings = draw_and_track(reference, drawn, workspace, times)
-    run = f"{method}-{steps}"
-    settings = reference_settings(reference, replace(PRESETS["standard"].settings_of(method), steps=steps))
+    names, run = list(trackings), f"{method}-{steps}"
+    settings = reference_settings(reference, replace(_PRESET.settings_of(method), steps=steps))
     alignment = AlignmentSettings()
-    if steps >= alignment.template_steps and one_camera(workspace, list(trackings)):
+    if steps >= alignment.template_steps and one_camera(workspace, names):
         with times.measured("align"):
-            run_alignment_stage(workspace, list(trackings), alignment, settings, keep=True)
+            run_alignment_stage(workspace, names, alignment, settings, keep=True)
     with times.measured("train"):
-        run_training_stage(workspace, list(trackings), run, PRESETS["standard"].config(method), settings)
+        run_training_stage(workspace, names, run, _PRESET.config(method), settings)
     with times.measured("evaluate"):
-        scored = (workspace.run_dir(run) / "metrics.json").is_file()
-        metrics = read_metrics(workspace.run_dir(run)) if scored else run_evaluation_stage(workspace, run, _SCORED)
-    errors = {name: _errors(workspace, drawn, name) for name in trackings}
-    summary = read_training_summary(workspace.run_dir(run))
+        metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
+    errors = {name: _errors(workspace, drawn, name) for name in names}
     with times.measured("views"):
         unseen = score_unseen_views(reference, drawn, workspace, run)
     by_truth: Figures = {}
     if reference.views is not None:
         with times.measured("views by true tracking"):
-            true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), list(trackings))
-            run_training_stage(true, list(trackings), run, PRESETS["standard"].config(method), settings)
+            true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), names)
+            run_training_stage(true, names, run, _PRESET.config(method), settings)
             by_truth = score_unseen_views(reference, drawn, true, run)
+    gaussians = read_training_summary(workspace.run_dir(run))["gaussians"]
     row = QualityRow(
-        reference.name,
-        key,
-        method,
-        steps,
-        summary["gaussians"],
-        protocol_means(metrics),
-        errors,
-        times.seconds,
-        unseen,
-        by_truth,
+        reference.name, key, method, steps, gaussians, protocol_means(metrics), errors, times.seconds, unseen, by_truth
     )
     return row, _strip(workspace, run)
 
@@ -143,7 +122,7 @@ def draw_and_track(
         for recipe in reference.sequences:
             _capture(workspace, drawn / recipe.name, recipe.name)
     with times.measured("track"):
-        return key, run_tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
+        return key, run_tracking_stage(workspace, "anny", TrackingSettings(), overlay="none")
 
 
 def reference_settings(reference: ReferenceCapture, settings: TrainSettings) -> TrainSettings:
@@ -175,25 +154,32 @@ def _workspace_of_truth(drawn: Path, workspace: Workspace, true: Workspace, name
 
 
 def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Workspace, run: str) -> Figures:
-    """Score a run on true pictures from all sides, if there are any. Writes a sheet and a chart beside its report."""
-    views = reference.views
+    """Score a run on true pictures from all sides, if there are any. Writes a sheet and a chart beside its report.
+
+    What was scored is read.
+    """
+    views, run_dir = reference.views, workspace.run_dir(run)
     if views is None:
         return {}
-    run_dir = workspace.run_dir(run)
+    file = run_dir / "unseen_view.json"
+    if file.is_file():
+        return read_json(file, "mien.unseen_view", 1, remedy=f"delete {file} and run the same command again")["angles"]
     experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
     capture, truth = read_capture(drawn / views.name / "capture"), read_truth(drawn / views.name / "truth")
     moments = tuple(views.first + views.every * index for index in range(capture.timesteps))
-    figures, sheet = score_side_views(experiment, views.sequence, SidePictures(capture, truth, moments), _UNSEEN)
+    figures, sheet = score_side_views(
+        experiment, views.sequence, SidePictures(capture, truth, moments), ScoreSettings(perceptual_frames=2)
+    )
     write_png(run_dir / "unseen_view.png", sheet)
     write_unseen_chart(run_dir / "unseen_view_chart.svg", figures)
-    write_json(run_dir / "unseen_view.json", "mien.unseen_view", 1, {"angles": figures})
+    write_json(file, "mien.unseen_view", 1, {"angles": figures})
     return figures
 
 
 def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
     """Capture a drawn video like a user's video, or copy the capture of calibrated cameras."""
     if (drawn / "video.mp4").is_file():
-        run_capture_stage(workspace, drawn / "video.mp4", name, CaptureSettings(cuts=False), replace=True)
+        run_capture_stage(workspace, [drawn / "video.mp4"], [name], None, CaptureSettings(cuts=False), replace=True)
         return
     target = workspace.sequence_dir(name) / "capture"
     if target.is_dir() and read_capture_hash(target) == read_capture_hash(drawn / "capture"):

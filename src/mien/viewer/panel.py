@@ -12,10 +12,10 @@ import viser
 from mien import runtime
 from mien.errors import UserError
 from mien.machine.terminal import printable
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, readable
 from mien.viewer.files import Stopped, screenshot, video
-from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Session, center_of
 from mien.viewer.work import Worker
 

@@ -24,8 +24,8 @@ from mien.errors import UserError
 from mien.machine.terminal import tell
 from mien.plugins import missing_package
 from mien.viewer.access import HEADERS, Door
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import View
-from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
 from mien.viewer.page import adapted
 from mien.viewer.panel import Panel, filmed_from
@@ -33,28 +33,19 @@ from mien.viewer.session import Session, center_of
 
 
 def serve(
-    session: Session,
-    door: Door,
-    port: int,
-    title: str,
-    ready: Callable[[str], None],
-    camera: CameraSwitch | None = None,
-    listener: socket.socket | None = None,
+    session: Session, door: Door, listener: socket.socket, title: str, camera: CameraSwitch | None = None
 ) -> None:
     """Show a session to browsers until Ctrl-C or SIGTERM, or until its camera ends.
 
     Args:
         session: The session.
-        door: Who may use it, and the host to listen on.
-        port: The port, or 0 for a free one.
+        door: Who may use it.
+        listener: What `listen` returned. Browsers may wait there already.
         title: Name of the avatar.
-        ready: Is called with the address, as soon as browsers can open it.
         camera: What lets the avatar follow a camera, if there is one.
-        listener: What `listen` returned for the host and the port, if browsers may wait there already.
     """
-    serving = Serving(session, door, port, title, camera, listener)
+    serving = Serving(session, door, listener, title, camera)
     try:
-        ready(serving.address)
         serving.wait()
     finally:
         serving.stop()
@@ -64,20 +55,13 @@ class Serving:
     """A server that runs."""
 
     def __init__(
-        self,
-        session: Session,
-        door: Door,
-        port: int,
-        title: str,
-        camera: CameraSwitch | None = None,
-        listener: socket.socket | None = None,
+        self, session: Session, door: Door, listener: socket.socket, title: str, camera: CameraSwitch | None = None
     ) -> None:
         """Start the server; the arguments are those of `serve`."""
         self.session, self.door, self._camera = session, door, camera
         self.failures: list[str] = []
         """The first failures of requests of browsers. The viewer goes on."""
         self._failing = threading.Lock()
-        listener = listener or listen(door.host, port)
         self.port = int(listener.getsockname()[1])
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
@@ -204,7 +188,9 @@ def listen(host: str, port: int) -> socket.socket:
     except (OSError, UnicodeError) as error:
         number = getattr(error, "errno", None)
         if number == errno.EADDRINUSE:
-            raise _taken(port) from None
+            raise UserError(
+                f"--port {port}: another program uses it; give another port, or leave --port out for a free one"
+            ) from None
         if number == errno.EACCES:
             raise UserError(f"--port {port}: is not allowed for this user; give one above 1023") from None
         raise UserError(
@@ -216,10 +202,6 @@ def address_of(door: Door, listener: socket.socket) -> str:
     """The address that people open to reach a socket."""
     host = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
     return door.address(host, int(listener.getsockname()[1]))
-
-
-def _taken(port: int) -> UserError:
-    return UserError(f"--port {port}: another program uses it; give another port, or leave --port out for a free one")
 
 
 @contextlib.contextmanager

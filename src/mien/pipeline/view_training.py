@@ -25,7 +25,7 @@ _NICE = 5
 _PATIENCE_SECONDS = 5.0
 
 
-class LiveView:
+class TrainingView:
     """Shows the avatar of a run in browsers, from its first steps to its end. Call it after each step."""
 
     def __init__(self, name: str, camera: Camera) -> None:
