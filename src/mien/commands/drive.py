@@ -12,8 +12,8 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
-from mien.pipeline.driver import name_driver, name_neutral
-from mien.pipeline.names import check_avatar, check_port, check_viewer, has_viewer
+from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.names import check_avatar, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
 
 
@@ -75,17 +75,20 @@ class Film(_Neutral, _Film, _Drive):
         open_workspace(self.workspace).pick_run(self.run_name)
         # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
-        name_driver(Path(self.by), self.sequence, self.fps, self.capture)
-        name_neutral(self.neutral)
+        check_driver(Path(self.by), self.sequence, self.fps, self.capture)
+        check_neutral(self.neutral)
 
     def run(self) -> None:
         """Track the driver if necessary, then pose and render every timestep."""
-        from mien.pipeline.drive import DriveOptions, run_driving_stage
+        from mien.driving.follower import FollowOptions
+        from mien.pipeline.drive import run_driving_stage
 
         workspace = open_workspace(self.workspace)
-        run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        how = self.head_pose, self.alone, self.fps, self.unlimited, self.neutral, self.capture
-        run_driving_stage(run_dir, Path(self.by), self.out, DriveOptions(self.sequence, *how), self.picture)
+        run_driving_stage(
+            workspace.run_dir(workspace.pick_run(self.run_name)), Path(self.by), self.out, self.picture,
+            FollowOptions(self.head_pose, self.unlimited), sequence=self.sequence, fps=self.fps, neutral=self.neutral,
+            capture=self.capture, alone=self.alone,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +102,9 @@ class Show(_Neutral, _Drive):
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         open_workspace(self.workspace).pick_run(self.run_name)
-        check_port(self.port)
-        check_viewer()
-        name_driver(Path(self.by), None, None, self.capture)
-        name_neutral(self.neutral)
+        check_viewer(self.port)
+        check_driver(Path(self.by), None, None, self.capture)
+        check_neutral(self.neutral)
 
     def run(self) -> None:
         """Show the avatar until Ctrl-C."""
@@ -131,10 +133,9 @@ class Follow(_Film, _Drive):
         """Check options and paths without heavy libraries."""
         check_avatar(self.workspace, self.run_name)
         camera_named(self.by, self.camera_format)
-        check_port(self.port)
-        if self.out is None:
-            check_viewer()
-        elif self.picture.plan(self.out, 2).kind != "mp4":
+        if self.out is None or has_viewer():
+            check_viewer(self.port)
+        if self.out is not None and self.picture.plan(self.out, 2).kind != "mp4":
             raise UserError(f"--out {self.out}: a camera is recorded as .mp4; choose such a name")
 
     def run(self) -> None:

@@ -12,7 +12,7 @@ from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, MotionOptions, NoOptions, PoseOptions
 from mien.formats.registry import find_format, format_of, formats, numbered
-from mien.pipeline.driver import name_driver, name_neutral
+from mien.pipeline.driver import check_driver, check_neutral
 
 
 def any_of(words: Iterable[str]) -> str:
@@ -146,7 +146,7 @@ def _kind(out: Path, name: str | None) -> Format:
 
 
 def _check_motion(workspace: Workspace, options: MotionOptions) -> None:
-    name_neutral(options.neutral)
+    check_neutral(options.neutral)
     names = workspace.sequence_names()
     if options.series is None or options.series in names:
         return
@@ -155,4 +155,4 @@ def _check_motion(workspace: Workspace, options: MotionOptions) -> None:
             f"--series {options.series}: no such sequence, file or folder; {workspace.root} has the sequences "
             f"{', '.join(names) or '(none)'}; or give a workspace, a video, a recording or a sound file"
         )
-    name_driver(Path(options.series), None)
+    check_driver(Path(options.series), None)

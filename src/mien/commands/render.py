@@ -238,14 +238,14 @@ class Render(_Look):
 
     def _draw_file(self) -> None:
         """Draw the avatar of a file, without torch."""
-        from mien.pipeline.draw_file import View, render_file
+        from mien.pipeline.draw_file import render_file
         from mien.runtime import camera_paths
 
         frames = self._frames(None)
-        view = View(
-            self.yaw, self.pitch, self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames)
-        )
-        render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
+        render_file(
+            self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, self.yaw, self.pitch,
+            self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames), self.fps,
+        )  # fmt: skip
 
     def _moved(self, paths: Any, camera: Any, center: "numpy.ndarray | torch.Tensor", frames: int) -> list[Any]:
         """The cameras of --path, by the module that moves cameras of this type."""

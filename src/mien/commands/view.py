@@ -7,8 +7,8 @@ from typing import Annotated
 import tyro
 
 from mien.errors import UserError
-from mien.pipeline.driver import name_driver, name_neutral
-from mien.pipeline.names import check_avatar, check_port, check_viewer
+from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.names import check_avatar, check_viewer
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,10 @@ class Command:
         check_avatar(self.avatar, self.run_name)
         if self.follow and not self.avatar.is_file():
             raise UserError(f"--follow: needs a .mien file, and {self.avatar} is a workspace; leave --follow out")
-        check_port(self.port)
         if self.play is not None:
-            name_driver(Path(self.play), None)
-        name_neutral(self.neutral)
-        check_viewer()
+            check_driver(Path(self.play), None)
+        check_neutral(self.neutral)
+        check_viewer(self.port)
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""

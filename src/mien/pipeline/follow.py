@@ -49,15 +49,7 @@ def run_following_stage(
 ) -> None:
     """Show an avatar that follows a camera, until Ctrl-C; with a recording of a file, until the file ends.
 
-    Args:
-        avatar: A workspace, or a .mien file.
-        run: The workspace's run.
-        name: The camera.
-        follow: How the camera is followed.
-        picture: The pictures of the recording.
-        out: The recording.
-        alone: Whether the recording shows only the avatar.
-        port: Port of the viewer, 0 for a free one, or None for no viewer.
+    `out` records it, without the camera's pictures beside the avatar if `alone`. Without a port, there is no viewer.
     """
     viewed = open_viewed(avatar, run)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh)

@@ -13,9 +13,8 @@ from mien.errors import UserError
 from mien.machine.terminal import plain_name
 
 
-def sequence_name(video: Path, name: str | None) -> str:
-    """`name`, or the video's name without its ending (with "_" for control characters), if a folder can have it."""
-    name = plain_name(video.stem) if name is None else name
+def run_name(name: str) -> str:
+    """The name of a run or a sequence, if a folder can have it."""
     if not is_plain_name(name):
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
@@ -33,30 +32,37 @@ def check_new_sequence(folder: Path) -> None:
         raise UserError(f"{folder}: is there already; delete it to import it again, or import into another workspace")
 
 
-def run_name(name: str) -> str:
-    """`name`, if a folder can have it."""
-    return sequence_name(Path(name), name)
-
-
 def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
-    """A name for each video: the given names, or else the names of the videos."""
-    if not videos:
-        raise UserError("no video given; write mien create VIDEO [VIDEO ...] --out DIR")
-    for video in videos:
-        if not video.exists():
-            raise UserError(f"{video}: no such video or folder of pictures; check the path")
+    """A name for each video: the given names, or else the names of the videos (with "_" for control characters)."""
     if names and len(names) != len(videos):
         counts = f"{len(names)} names, but the number of videos is {len(videos)}"
         raise UserError(f"--name {' '.join(names)}: {counts}; give one name for each")
-    found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
+    found = [run_name(name) for name in names or [plain_name(video.stem) for video in videos]]
     twice = [name for name, count in Counter(found).items() if count > 1]
     if twice:
         raise UserError(f"two videos would both be the sequence {twice[0]!r}; give each a name with --name")
     return found
 
 
+def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
+    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder."""
+    if not calibration.is_file():
+        what = "is a folder" if calibration.is_dir() else "no such file"
+        raise UserError(f"--calibration {calibration}: {what}; give the json file of its cameras (docs/using.md)")
+    if len(names) > 1:
+        raise UserError(f"--name {' '.join(names)}: all cameras together become one sequence; give one name")
+    if not names and len(sources) > 1:
+        raise UserError("--calibration: several videos become one sequence; name it with --name")
+    return run_name(names[0] if names else plain_name(sources[0].resolve().stem))
+
+
 def check_sources(videos: Sequence[Path], names: Sequence[str], calibration: Path | None) -> None:
     """Check videos and names before anything heavy is loaded. Folders of pictures are left to the capture."""
+    if not videos:
+        raise UserError("no video given; name a video, or with --calibration those of all cameras or their folder")
+    for video in videos:
+        if not video.exists():
+            raise UserError(f"{video}: no such video or folder of pictures; check the path")
     if calibration is None:
         sequence_names(videos, names)
     else:
@@ -73,24 +79,6 @@ def is_picture(file: Path) -> bool:
 
     with open_video(file) as (container, _):
         return container.format.name.endswith("_pipe")  # FFmpeg's names of pictures: png_pipe, jpeg_pipe.
-
-
-def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
-    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder."""
-    if calibration.is_dir():
-        raise UserError(f"--calibration {calibration}: is a folder; give the json file of its cameras (docs/using.md)")
-    if not calibration.is_file():
-        raise UserError(f"--calibration {calibration}: no such file; name a json file of cameras (docs/using.md)")
-    if not sources:
-        raise UserError("--calibration: name the videos of its cameras, or a folder that holds them")
-    for source in sources:
-        if not source.exists():
-            raise UserError(f"{source}: no such video or folder of pictures; check the path")
-    if len(names) > 1:
-        raise UserError(f"--name {' '.join(names)}: all cameras together become one sequence; give one name")
-    if not names and len(sources) > 1:
-        raise UserError("--calibration: several videos become one sequence; name it with --name")
-    return sequence_name(sources[0].resolve(), names[0] if names else None)
 
 
 def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Sequence[str]) -> Iterator[str]:
@@ -112,11 +100,8 @@ def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Seque
 
 
 def _same_content(first: Path, second: Path) -> bool:
-    if first.samefile(second):
-        return True
-    if not (first.is_file() and second.is_file()) or first.stat().st_size != second.stat().st_size:
-        return False
-    return file_digest(first) == file_digest(second)
+    files = first.is_file() and second.is_file() and first.stat().st_size == second.stat().st_size
+    return first.samefile(second) or (files and file_digest(first) == file_digest(second))
 
 
 def no_model_file(path: Path) -> str:
@@ -140,18 +125,14 @@ def check_avatar(avatar: Path, run: str | None) -> None:
         open_workspace(avatar).pick_run(run)
 
 
-def check_port(port: int) -> None:
-    """Check the port of a viewer."""
-    if not 0 <= port <= 65_535:
-        raise UserError(f"--port {port}: give a number from 1 to 65535, or 0 for a free one")
-
-
 def has_viewer() -> bool:
     """Whether the package of the viewer's page is installed."""
     return importlib.util.find_spec("viser") is not None
 
 
-def check_viewer() -> None:
-    """Check that the package of the viewer's page is installed."""
+def check_viewer(port: int = 0) -> None:
+    """Check the port of a viewer, and that the package of its page is installed."""
+    if not 0 <= port <= 65_535:
+        raise UserError(f"--port {port}: give a number from 1 to 65535, or 0 for a free one")
     if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")

@@ -60,19 +60,8 @@ def run_viewing_stage(
 ) -> None:
     """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes.
 
-    The address is told at once. Browsers that open it wait until the avatar is loaded.
-
-    Args:
-        avatar: A workspace, or a .mien file.
-        run: The workspace's run.
-        play: A motion besides those of the workspace: what `mien drive --by` takes.
-        neutral: The face at rest of all motions, as `--neutral` names it.
-        capture: How `play` is captured if it is filmed.
-        at_once: Whether `play` plays as soon as the viewer opens.
-        host: Where the viewer listens.
-        port: The port, or 0 for a free one.
-        token: Whether browsers need a token.
-        follow: Whether the file is shown anew.
+    `play` is a motion besides those of the workspace, as `mien drive --by` takes it; `at_once` plays it as soon as the
+    viewer opens. `neutral` is the face at rest of all motions. The address is told at once: browsers that open it wait.
     """
     door = Door.of(host, token)
     with contextlib.closing(listen(host, port)) as listener:
