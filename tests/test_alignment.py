@@ -26,7 +26,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import l1
 from mien.face import FaceModel, FaceParams
 from mien.pipeline.drive import open_driver
-from mien.pipeline.driver import check_neutral
+from mien.pipeline.names import check_neutral
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import read_tracking
 from mien.training import TrainSettings, train

@@ -12,8 +12,7 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
-from mien.pipeline.driver import check_driver, check_neutral
-from mien.pipeline.names import check_avatar, check_viewer, has_viewer
+from mien.pipeline.names import check_avatar, check_driver, check_neutral, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
 
 

@@ -12,7 +12,7 @@ from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, MotionOptions, NoOptions, PoseOptions
 from mien.formats.registry import find_format, format_of, formats, numbered
-from mien.pipeline.driver import check_driver, check_neutral
+from mien.pipeline.names import check_driver, check_neutral
 
 
 def any_of(words: Iterable[str]) -> str:

@@ -74,10 +74,9 @@ class _Look:
 
     def camera(self, run_dir: Path, subject: "mien.face.FaceParams", options: PictureOptions) -> "mien.camera.Camera":
         """The run's first camera, moved by --yaw, --pitch and --zoom."""
-        from mien.pipeline.draw import view
         from mien.training.run import run_camera
 
-        return self.turned(view(options, run_camera(run_dir), self.magnification), subject)
+        return self.turned(run_camera(run_dir).fitted(*options.shape(), self.magnification), subject)
 
     def turned(self, camera: "mien.camera.Camera", subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """A camera moved by --yaw and --pitch."""
@@ -211,7 +210,7 @@ class Render(_Look):
         timesteps: int | None,
     ) -> "list[mien.camera.Camera]":
         """The camera of each frame."""
-        from mien.pipeline.draw import posed_softly, view, whole
+        from mien.pipeline.draw import posed_softly, whole
         from mien.render import camera_paths
         from mien.tracking.files import read_tracking
 
@@ -225,7 +224,7 @@ class Render(_Look):
         elif self.path == "captured":
             name = workspace.pick_sequence(self._sequence)
             stored = read_tracking(workspace.sequence_dir(name) / "tracking").cameras
-            cameras = [view(self.picture, camera, self.magnification) for camera in stored]
+            cameras = [camera.fitted(*self.picture.shape(), self.magnification) for camera in stored]
             if self._is_still():
                 cameras = cameras[:1]
             elif timesteps is not None:

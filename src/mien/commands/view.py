@@ -7,8 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.errors import UserError
-from mien.pipeline.driver import check_driver, check_neutral
-from mien.pipeline.names import check_avatar, check_viewer
+from mien.pipeline.names import check_avatar, check_driver, check_neutral, check_viewer
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,8 @@ from mien.media.pictures import side_by_side
 from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage
-from mien.pipeline.draw import draw, posed_softly, view, warn_of_white
-from mien.pipeline.driver import NEUTRALS, Kind, check_driver, check_neutral
-from mien.pipeline.names import is_picture
+from mien.pipeline.draw import draw, posed_softly, warn_of_white
+from mien.pipeline.names import NEUTRALS, Kind, check_driver, check_neutral, is_picture
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.track import run_tracking_stage
 from mien.tracking.settings import TrackingSettings
@@ -144,7 +143,7 @@ def run_driving_stage(
     driven = drive(driver.face, driver.at_rest, person, bounds, follow.head_pose, str(by))
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
-    camera = view(picture, filmed_by)
+    camera = filmed_by.fitted(*picture.shape())
     if not follow.unlimited:
         filmed = filmed_range(run_dir, avatar)
         driven, softened = keep_to_filmed(driven, filmed, avatar.subject, bounds, camera.position)

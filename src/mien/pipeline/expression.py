@@ -35,9 +35,10 @@ def tell_of_unfilmed(assignments: tuple[str, ...], face: FaceParams, model: Face
                 continue
             index = names.index(part.name)
             value, shown = (values[index], f"{values[index]:.2f}") if part.is_added else (part.value, text)
-            lowest, highest = min(0.0, float(filmed.lowest[index])), max(0.0, float(filmed.highest[index]))
-            # To the digits that are shown: nobody sees what lies between.
-            if not round(lowest, 2) <= round(value, 2) <= round(highest, 2):
+            # To the digits that are shown: nobody sees what lies between. Adding 0 makes -0 to 0.
+            lowest = round(min(0.0, float(filmed.lowest[index])), 2) + 0.0
+            highest = round(max(0.0, float(filmed.highest[index])), 2)
+            if not lowest <= round(value, 2) <= highest:
                 beyond.append(f"{part.name}={shown} ({lowest:.2f} to {highest:.2f})")
     if beyond:
         say(f"beyond what was filmed, so it may look wrong: {', '.join(beyond)}")

@@ -9,12 +9,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from mien import runtime
-from mien.avatar.baking import as_array
-from mien.camera import Camera
 from mien.disk.files import cannot_write
 from mien.driving.follower import FollowOptions
 from mien.errors import UserError
@@ -26,6 +23,7 @@ from mien.media.video import write_video
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.view import open_viewed
 from mien.pipeline.view_motions import switch_of
+from mien.runtime.camera_paths import fitted
 from mien.viewer.access import Door
 from mien.viewer.camera import CameraSwitch
 from mien.viewer.server import address_of, listen, serve
@@ -33,7 +31,6 @@ from mien.viewer.session import Seen, Session
 
 FPS = 25
 """Frames a second of a recording."""
-_QUALITY = 23
 _WAIT_SECONDS = 0.2
 
 
@@ -87,10 +84,7 @@ class _Recorder:
     def __init__(self, session: Session, switch: CameraSwitch, options: PictureOptions, out: Path, alone: bool) -> None:
         self._session, self._switch, self._options, self._out, self._alone = session, switch, options, out, alone
         self._newest: queue.Queue[tuple[runtime.Face, Seen] | None] = queue.Queue(maxsize=1)
-        given = session.avatar.camera
-        camera = Camera(torch.from_numpy(given.K), torch.from_numpy(given.viewmat), given.width, given.height)
-        wanted = camera.fitted(*options.shape())
-        self._camera = runtime.Camera(as_array(wanted.K), as_array(wanted.viewmat), wanted.width, wanted.height)
+        self._camera = fitted(session.avatar.camera, *options.shape())
         self.pictures = 0
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="mien-recording", daemon=True)
@@ -123,7 +117,7 @@ class _Recorder:
 
     def _run(self) -> None:
         try:
-            write_video(self._out, self._frames(), FPS, _QUALITY, "ultrafast")
+            write_video(self._out, self._frames(), FPS, 23, "ultrafast")
         except UserError as error:
             self._error = error
         except OSError as error:

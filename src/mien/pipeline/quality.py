@@ -25,7 +25,7 @@ from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
-from mien.lab.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
+from mien.lab.benchmarking.quality import QualityRow, markdown_table, tracking_errors
 from mien.lab.benchmarking.unseen_views import (
     Figures,
     SidePictures,
@@ -43,7 +43,7 @@ from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.evaluate import run_evaluation_stage, run_sequences
 from mien.pipeline.track import run_tracking_stage
 from mien.pipeline.train import run_training_stage
-from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.files import write_tracking
 from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.tracking.settings import TrackingSettings
@@ -53,7 +53,6 @@ from mien.training.run import read_training_summary
 from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 
 _FORMAT, _VERSION = "mien.bench_quality", 1
-_SHEET_SIDE, _SHEET_FRAMES = 192, 6
 _SCORED, _PRESET = EvaluationSettings(perceptual_frames=8, video_frames=0), PRESETS["standard"]
 
 
@@ -93,7 +92,13 @@ def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: i
         run_training_stage(workspace, names, run, _PRESET.config(method), settings)
     with times.measured("evaluate"):
         metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
-    errors = {name: _errors(workspace, drawn, name) for name in names}
+    errors = {
+        name: tracking_errors(
+            tracking, read_capture(workspace.sequence_dir(name) / "capture"), read_truth(drawn / name / "truth"),
+            load_face_model(tracking.face_model),
+        )
+        for name, tracking in trackings.items()
+    }  # fmt: skip
     with times.measured("views"):
         unseen = score_unseen_views(reference, drawn, workspace, run)
     by_truth: Figures = {}
@@ -119,8 +124,11 @@ def draw_and_track(
     with times.measured("draw"):
         key = reference.write(drawn)
     with times.measured("capture"):
-        for recipe in reference.sequences:
-            _capture(workspace, drawn / recipe.name, recipe.name)
+        for name in (recipe.name for recipe in reference.sequences):
+            if (video := drawn / name / "video.mp4").is_file():
+                run_capture_stage(workspace, [video], [name], None, CaptureSettings(cuts=False), replace=True)
+            else:
+                _copy_capture(drawn / name / "capture", workspace.sequence_dir(name))
     with times.measured("track"):
         return key, run_tracking_stage(workspace, "anny", TrackingSettings(), overlay="none")
 
@@ -147,9 +155,7 @@ def _workspace_of_truth(drawn: Path, workspace: Workspace, true: Workspace, name
             write_tracking(folder / "tracking", truth)
             scoring = make_scoring(read_capture(own), truth, load_face_model(truth.face_model), scratch=folder)
             write_scoring(folder / "scoring", scoring, pictures)
-            # The capture comes last: it says that the rest is there.
-            shutil.copytree(own, folder / ".capture.partial", dirs_exist_ok=True)
-            replace_folder(folder / "capture", folder / ".capture.partial")
+        _copy_capture(own, folder)  # it comes last: it says that the rest is there
     return true
 
 
@@ -176,25 +182,15 @@ def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Work
     return figures
 
 
-def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
-    """Capture a drawn video like a user's video, or copy the capture of calibrated cameras."""
-    if (drawn / "video.mp4").is_file():
-        run_capture_stage(workspace, [drawn / "video.mp4"], [name], None, CaptureSettings(cuts=False), replace=True)
+def _copy_capture(source: Path, folder: Path) -> None:
+    """Copy the capture of calibrated cameras into the folder of a sequence, unless it is there."""
+    aside, target = folder / ".capture.partial", folder / "capture"
+    if target.is_dir() and read_capture_hash(target) == read_capture_hash(source):
         return
-    target = workspace.sequence_dir(name) / "capture"
-    if target.is_dir() and read_capture_hash(target) == read_capture_hash(drawn / "capture"):
-        return
-    aside = target.with_name(".capture.partial")
-    with hold(workspace.sequence_dir(name)):
+    with hold(folder):
         remove_tree(aside)
-        shutil.copytree(drawn / "capture", aside)
+        shutil.copytree(source, aside)
         replace_folder(target, aside)
-
-
-def _errors(workspace: Workspace, drawn: Path, name: str) -> TrackingErrors:
-    folder = workspace.sequence_dir(name)
-    tracking, truth = read_tracking(folder / "tracking"), read_truth(drawn / name / "truth")
-    return tracking_errors(tracking, read_capture(folder / "capture"), truth, load_face_model(tracking.face_model))
 
 
 class StageTimes:
@@ -222,13 +218,13 @@ def _strip(workspace: Workspace, run: str) -> np.ndarray:
     """Head crops of held-out pictures in a row, above those of the avatar."""
     run_dir = workspace.run_dir(run)
     experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
-    frames = experiment.held_out_frames
+    frames, count = experiment.held_out_frames, 6
     # Choose at random: evenly spread frames of several cameras could show one camera again and again.
-    places = np.random.default_rng(0).choice(len(frames), _SHEET_FRAMES, replace=len(frames) < _SHEET_FRAMES)
+    places = np.random.default_rng(0).choice(len(frames), count, replace=len(frames) < count)
     chosen = [frames[index] for index in np.sort(places)]
 
     def tile(picture: torch.Tensor, frame: Frame) -> np.ndarray:
-        return in_white_square(crop_to(picture, experiment.crop(frame)), _SHEET_SIDE)
+        return in_white_square(crop_to(picture, experiment.crop(frame)), 192)
 
     return np.concatenate([
         np.concatenate([tile(draw(experiment, frame), frame) for frame in chosen], 1)
