@@ -243,7 +243,7 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, made_once: MadeOnce, caps
     for words, *arguments in (
         ("no such file", tmp_path / "gone.mien"), ("is no .mien file", __file__), ("cut.mien: is damaged", cut),
         ("leave --run out", file, "--run", "toy"), ("no run 'x'", workspace, "--run", "x"),
-        ("from 1 to 65535", workspace, "--port", "65536"),
+        ("from 0 to 65535", workspace, "--port", "65536"),
         ("gone.csv: no such file", workspace, "--play", "gone.csv"),
         ("--no-token: other machines can reach --host 0.0.0.0", file, "--host", "0.0.0.0", "--no-token"),
         ("--host nowhere.invalid: is no address of this machine", workspace, "--host", "nowhere.invalid"),

@@ -12,10 +12,11 @@ import tyro
 
 from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
 from mien.batch.plan import Batch, Options, Row
+from mien.disk.config import Range
 from mien.errors import UserError
 from mien.machine.terminal import show
 
-_WATCH_SECONDS = 5.0
+_COUNT = Range(0, 100_000)
 
 
 @dataclass(frozen=True)
@@ -39,17 +40,17 @@ class Run:
     """The engine that runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
     shard: str = ""
     """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
-    retry: int = 2
+    retry: Annotated[int, _COUNT] = 2
     """How often a failed row is tried again."""
-    jobs: int = 0
+    jobs: Annotated[int, _COUNT] = 0
     """Largest number of rows at once. 0 means as many as memory and cores allow."""
-    threads: int = 0
+    threads: Annotated[int, _COUNT] = 0
     """Threads of each row. 0 shares the cores out, or asks a cluster for two."""
-    gpus: float = 0.0
+    gpus: Annotated[float, Range(0, 64)] = 0.0
     """GPUs of each row, on Slurm and Ray."""
     partition: str = ""
     """Partition of Slurm."""
-    time: int = 0
+    time: Annotated[int, _COUNT] = 0
     """Time limit of a row in minutes, for Slurm. 0 means three times the longest finished row, at first a day."""
     ray_address: str = ""
     """Address of a Ray cluster (default: RAY_ADDRESS, or a Ray that is started here)."""
@@ -72,11 +73,6 @@ class Run:
         if module is not None and importlib.util.find_spec(module) is None:
             raise ModuleNotFoundError(f"No module named {module!r}", name=module)
         check_writable(self.out, folder=True)
-        for name, value in (("retry", self.retry), ("jobs", self.jobs), ("threads", self.threads), ("time", self.time)):
-            if not 0 <= value <= 100_000:
-                raise UserError(f"--{name} {value}: give a number from 0 to 100000")
-        if not 0 <= self.gpus <= 64:
-            raise UserError(f"--gpus {self.gpus:g}: give a number from 0 to 64")
         if self.shard:
             shard_of([], self.shard)
         if self.store and "://" not in self.store:
@@ -161,7 +157,7 @@ class Status:
             show(json.dumps(found, indent=1) if self.as_json else progress_text(found))
             if not self.watch or not set(found["counts"]) & {"waiting", "running", "interrupted"}:
                 return
-            time.sleep(_WATCH_SECONDS)
+            time.sleep(5)
 
 
 @dataclass(frozen=True)

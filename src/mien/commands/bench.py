@@ -1,7 +1,6 @@
 """Measure this machine and this version of mien."""
 
 import json
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.commands.train_options import check_method, listed_methods
+from mien.disk.config import POSITIVE, Range
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
@@ -31,19 +31,14 @@ CaptureName = Literal[
 ]  # fmt: skip
 """The keys of `REFERENCES` in `mien.lab.synthetic`. They are written out because options are read before torch. A test
 compares them."""
-_MOST_MINUTES = 100_000
 
 
 @dataclass(frozen=True)
 class _Timed:
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
-    seconds: float = 0.8
+    seconds: Annotated[float, POSITIVE] = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
-
-    def _check_seconds(self) -> None:
-        if not 0 < self.seconds < math.inf:
-            raise UserError(f"--seconds {self.seconds:g}: give a positive number; each row is measured for that long")
 
 
 @dataclass(frozen=True)
@@ -54,8 +49,7 @@ class Render(_Timed):
     """Device to draw on. cuda measures gsplat on a GPU, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Check that CUDA has gsplat and that there is time to measure."""
-        self._check_seconds()
+        """Check that CUDA has gsplat."""
         check_device(self.device)
 
     def run(self) -> None:
@@ -75,10 +69,9 @@ class Scaling(_Timed):
     """File for a chart, .svg (default: no chart)."""
 
     def check(self) -> None:
-        """Check before any measurement that the chart can be written and that there is time to measure."""
+        """Check before any measurement that the chart can be written."""
         from mien.disk.files import check_writable
 
-        self._check_seconds()
         if self.plot is not None:
             if self.plot.suffix != ".svg":
                 raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
@@ -104,14 +97,13 @@ class TrainStep(_Timed):
     """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
     A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
     fastest round."""
-    seconds: float = 3.0
+    seconds: Annotated[float, POSITIVE] = 3.0
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
     """Device to train on. cuda measures a GPU, where gsplat draws, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Check that CUDA has gsplat and that there is time to measure."""
-        self._check_seconds()
+        """Check that CUDA has gsplat, and that the options fit together."""
         check_device(self.device)
         if self.method not in GPU_BENCHMARKS and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
@@ -144,7 +136,7 @@ class Quality:
     captures: tuple[CaptureName, ...] = ()
     """Names of reference captures (default: all but ring-16-large, which takes hours)."""
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
-    steps: int = 0
+    steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps. 0 means each capture's own number."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
@@ -152,10 +144,8 @@ class Quality:
     """Print all rows as json, for programs."""
 
     def check(self) -> None:
-        """Check that there is such a method, and that the number of steps is not negative."""
+        """Check that there is such a method."""
         check_method("--method", self.method)
-        if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own number")
 
     def run(self) -> None:
         """Run every capture through all stages, then print the table."""
@@ -178,10 +168,10 @@ class Compare:
     captures: tuple[CaptureName, ...] = ()
     """Reference captures as well. They are drawn, captured and tracked in --out first."""
     methods: Annotated[tuple[str, ...], listed_methods("Methods to compare")] = tuple(METHODS)
-    minutes: float = 0.0
+    minutes: Annotated[float, Range(0, 100_000)] = 0.0
     """Minutes of training for each method on each capture. Two short trials on this machine turn them into steps. 0
     means --steps."""
-    steps: int = 0
+    steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
     split: Literal["blocks", "tail"] = "blocks"
     """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
@@ -197,10 +187,6 @@ class Compare:
 
         if not self.workspaces and not self.captures:
             raise UserError("nothing to compare on; give workspace folders, or --captures NAME")
-        if not 0 <= self.minutes <= _MOST_MINUTES:
-            raise UserError(f"--minutes {self.minutes:g}: give a number from 0 to {_MOST_MINUTES}")
-        if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
         if self.minutes and self.steps:
             raise UserError(f"--minutes {self.minutes:g} --steps {self.steps}: give one of them")
         if not self.methods:

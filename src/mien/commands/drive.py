@@ -12,7 +12,7 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
-from mien.pipeline.names import check_avatar, check_driver, check_neutral, check_viewer, has_viewer
+from mien.pipeline.names import PORT, check_avatar, check_driver, check_neutral, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
 
 
@@ -95,13 +95,13 @@ class Show(_Neutral, _Drive):
     """Play the motion of somebody else in a viewer in the browser. --out FILE.mp4 writes a film, with more options."""
 
     remedy: ClassVar[str] = "options of films need --out FILE.mp4; "
-    port: int = 0
-    """Port of the viewer, from 1 to 65535. 0 means a free one."""
+    port: Annotated[int, PORT] = 0
+    """Port of the viewer. 0 means a free one."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         open_workspace(self.workspace).pick_run(self.run_name)
-        check_viewer(self.port)
+        check_viewer()
         check_driver(Path(self.by), None, None, self.capture)
         check_neutral(self.neutral)
 
@@ -125,16 +125,16 @@ class Follow(_Film, _Drive):
     camera_format: CameraFormat | None = None
     """The interface that reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the
     platform's."""
-    port: int = 0
-    """Port of the viewer, from 1 to 65535. 0 means a free one."""
+    port: Annotated[int, PORT] = 0
+    """Port of the viewer. 0 means a free one."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         check_avatar(self.workspace, self.run_name)
         camera_named(self.by, self.camera_format)
-        if self.out is None or has_viewer():
-            check_viewer(self.port)
-        if self.out is not None and self.picture.plan(self.out, 2).kind != "mp4":
+        if self.out is None:
+            check_viewer()
+        elif self.picture.plan(self.out, 2).kind != "mp4":
             raise UserError(f"--out {self.out}: a camera is recorded as .mp4; choose such a name")
 
     def run(self) -> None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import tyro
 
 from mien.commands.train_options import TrainOptions
-from mien.disk.config import Range, shown
+from mien.disk.config import Range, check_range, shown
 from mien.errors import UserError
 from mien.machine.terminal import show
 
@@ -56,26 +56,28 @@ def parse(module: ModuleType, name: str, arguments: Sequence[str]) -> Any:
     return parse_options(tasks[task], prog, rest)
 
 
-def parse_options(command: type, prog: str, arguments: Sequence[str]) -> Any:
+def parse_options(kind: type, prog: str, arguments: Sequence[str]) -> Any:
     """The options of a command. Their defaults are those of the preset and the file that the arguments name."""
-    default, names = with_defaults(command, arguments), [argument.partition("=")[0] for argument in arguments]
+    default, names = with_defaults(kind, arguments), [argument.partition("=")[0] for argument in arguments]
     parts = [default, *(part for part in vars(default).values() if is_dataclass(part))]
     for name in (name for part in parts for name, value in vars(part).items() if isinstance(value, tuple)):
         if names.count(option := f"--{name.replace('_', '-')}") > 1:
             # The first of its values would be dropped without a word.
             raise UserError(f"{option} is given twice; give it once, followed by all of its values")
     if {"-h", "--help", "--help-all"} & {*arguments}:
-        _help(command, prog, arguments)
-    told, more = io.StringIO(), getattr(command, "takes_more", False)
+        _help(kind, prog, arguments)
+    told, more = io.StringIO(), getattr(kind, "takes_more", False)
     try:
         with contextlib.redirect_stderr(told):
-            found = tyro.cli(
-                command, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more
-            )
+            found = tyro.cli(kind, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more)
     except SystemExit:
-        remedy = getattr(command, "remedy", "")
+        remedy = getattr(kind, "remedy", "")
         raise UserError(f"{in_one_line(told.getvalue())}; {remedy}see {prog} --help-all") from None
-    return replace(found[0], for_all=tuple(found[1])) if more else found
+    command = replace(found[0], for_all=tuple(found[1])) if more else found
+    for name, option, _, marks in _named_fields(type(command), ""):  # groups of settings check themselves
+        for allowed in (mark for mark in marks if isinstance(mark, Range)):
+            check_range(getattr(command, name), allowed, f"--{option}")
+    return command
 
 
 def with_defaults(command: type, arguments: Sequence[str]) -> Any:

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.errors import UserError
-from mien.pipeline.names import check_avatar, check_driver, check_neutral, check_viewer
+from mien.pipeline.names import PORT, check_avatar, check_driver, check_neutral, check_viewer
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Command:
     neutral: str | None = None
     """The face at rest of --play and of the workspace's sequences, as for `mien drive`: first, calm, model, or a video,
     recording, workspace or sequence folder of the driver at rest."""
-    port: int = 0
-    """Port of the server, from 1 to 65535. 0 means a free one."""
+    port: Annotated[int, PORT] = 0
+    """Port of the server. 0 means a free one."""
     follow: bool = False
     """Show the .mien file anew each time it changes."""
     host: str = "127.0.0.1"
@@ -41,7 +41,7 @@ class Command:
         if self.play is not None:
             check_driver(Path(self.play), None)
         check_neutral(self.neutral)
-        check_viewer(self.port)
+        check_viewer()
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""

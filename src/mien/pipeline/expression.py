@@ -1,15 +1,20 @@
 """Expressions, gaze, preset faces and joints on the command line: `--set jawOpen=0.6 smile=0.4 left_eye_y=0.2`."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
+from mien.avatar.avatar import Avatar
+from mien.errors import UserError
+from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.machine.progress import say
 from mien.pipeline.assignments import Settable, angle_names, assign
 from mien.runtime.baked import Filmed
 from mien.runtime.named import is_gaze, parts_of
+from mien.training.run import filmed_range, read_face_track
 
 
 def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, ...]) -> FaceParams:
@@ -23,6 +28,30 @@ def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, 
         expression=torch.from_numpy(expression).to(face.expression),
         joints=torch.from_numpy(joints).to(face.joints),
     )
+
+
+def chosen_face(
+    run_dir: Path, avatar: Avatar, motion: FaceParams | None, timestep: int | None, assignments: tuple[str, ...]
+) -> FaceParams:
+    """The avatar's face in a motion, at a timestep of it or of the training, or at rest, with expressions by name.
+
+    What was never filmed is told.
+    """
+    model, subject = avatar.face_model, avatar.subject
+    if timestep is not None:
+        motion = read_face_track(run_dir, model) if motion is None else motion
+        if not 0 <= timestep < len(motion):
+            raise UserError(f"--timestep {timestep}: {run_dir} has the timesteps 0 to {len(motion) - 1}; give one")
+        motion = motion[timestep]
+    face = replace(
+        subject if motion is None else motion, identity=subject.identity, vertex_offsets=subject.vertex_offsets
+    )
+    check_face_params(model, face, "--motion", "choose a sequence that was tracked with the avatar's face model")
+    if not assignments:
+        return face
+    face = with_expression(face, model, assignments)
+    tell_of_unfilmed(assignments, face, model, filmed_range(run_dir, avatar))
+    return face
 
 
 def tell_of_unfilmed(assignments: tuple[str, ...], face: FaceParams, model: FaceModel, filmed: Filmed) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from mien.capture.settings import CaptureSettings
+from mien.disk.config import Range
 from mien.disk.files import file_digest
 from mien.disk.inside import is_plain_name
 from mien.disk.workspace import check_no_workspace, is_workspace, open_workspace
@@ -16,6 +17,8 @@ from mien.errors import UserError
 from mien.machine.terminal import plain_name
 from mien.media.output import SOUND_ENDINGS
 
+PORT = Range(0, 65_535)
+"""Allowed ports of a viewer."""
 Kind = Literal["recording", "film", "sequence", "workspace"]
 """A file of another program or a voice; a video, a picture or a folder of pictures; the folder of a tracked sequence;
 or a workspace."""
@@ -144,10 +147,8 @@ def has_viewer() -> bool:
     return importlib.util.find_spec("viser") is not None
 
 
-def check_viewer(port: int = 0) -> None:
-    """Check the port of a viewer, and that the package of its page is installed."""
-    if not 0 <= port <= 65_535:
-        raise UserError(f"--port {port}: give a number from 1 to 65535, or 0 for a free one")
+def check_viewer() -> None:
+    """Check that the package of the viewer's page is installed."""
     if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
 
