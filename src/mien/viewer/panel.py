@@ -16,8 +16,8 @@ from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, readable
 from mien.viewer.files import Stopped, screenshot, video
+from mien.viewer.loop import Worker
 from mien.viewer.session import Session, center_of
-from mien.viewer.work import Worker
 
 MAX_ANGLE = 0.5
 """Largest angle of a joint's slider, in radians."""
@@ -39,13 +39,8 @@ class Panel:
     ) -> None:
         """Add the controls to a server.
 
-        Args:
-            server: The server.
-            session: What the controls change.
-            title: Name of the avatar, for people and for the files that are saved.
-            view_of: Returns the view of a client's camera.
-            failed: Is called with an exception of slow work.
-            camera: What lets the avatar follow a camera, if there is one.
+        `title` names the avatar, for people and for the files that are saved; `view_of` returns the view of a client's
+        camera; `failed` takes an exception of slow work.
         """
         self._server, self._session, self._view_of = server, session, view_of
         self._title = printable(Path(title).name) or "avatar"
@@ -89,7 +84,7 @@ class Panel:
         self._followed_at = now
         self._name_play()
         if self._report is not None and self._camera is not None:
-            self._report.content = _plain_lines(self._camera.report())
+            self._report.content = "  \n".join(map(_plain, self._camera.report()))
         if self._time is not None:
             self._time.value = self._session.timestep
 
@@ -380,7 +375,3 @@ def _rounded(value: float, low: float, high: float) -> float:
 def _plain(text: str) -> str:
     """A text without characters that Markdown or HTML would read."""
     return "".join(character if character.isalnum() or character in " -._" else " " for character in printable(text))
-
-
-def _plain_lines(lines: list[str]) -> str:
-    return "  \n".join(_plain(line) for line in lines)

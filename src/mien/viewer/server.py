@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import gzip
 import http.client
 import io
 import logging
@@ -27,9 +28,29 @@ from mien.viewer.access import HEADERS, Door
 from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import View
 from mien.viewer.loop import DrawingLoop
-from mien.viewer.page import adapted
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, center_of
+
+_SCRIPT = """<script>
+// mien draws the pictures, not the browser: without these words viser does not ask whether the browser has a GPU.
+for (const kind of [self.WebGLRenderingContext, self.WebGL2RenderingContext]) {
+  if (!kind) continue;
+  const get = kind.prototype.getExtension;
+  kind.prototype.getExtension = function (name) {
+    return name === "WEBGL_debug_renderer_info" ? null : get.call(this, name);
+  };
+}
+// On phones, viser's panel lies over the avatar: it begins folded, and a touch of its title unfolds it. How wide the
+// window is shows only after this script, because the words on the viewport come later in the page.
+new MutationObserver((changes, watch) => {
+  const isTitle = ({ style }) => style.height === "3.5em" && style.cursor === "pointer";
+  const title = [...document.querySelectorAll("div")].find(isTitle);
+  if (!title) return;
+  watch.disconnect();
+  if (matchMedia("(max-width: 36em)").matches) title.click();
+}).observe(document, { childList: true, subtree: true });
+</script>"""
+"""What mien adds to viser's page: no warning of a missing GPU, and a folded panel on phones."""
 
 
 def serve(
@@ -37,12 +58,7 @@ def serve(
 ) -> None:
     """Show a session to browsers until Ctrl-C or SIGTERM, or until its camera ends.
 
-    Args:
-        session: The session.
-        door: Who may use it.
-        listener: What `listen` returned. Browsers may wait there already.
-        title: Name of the avatar.
-        camera: What lets the avatar follow a camera, if there is one.
+    `door` says who may use it. Browsers may wait already at the listener, which `listen` returned.
     """
     serving = Serving(session, door, listener, title, camera)
     try:
@@ -225,10 +241,10 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
         **named: Any,
     ) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
-            response = _refused(door, request)
+            response = door.answer(request.path, dict(request.headers.raw_items()))
             if response is None:
                 given = process_request(connection, request)
-                response = None if given is None else adapted(given)
+                response = None if given is None else _adapted(given)
             if response is not None:
                 response.headers.update(HEADERS)
             return response
@@ -243,14 +259,18 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
         module.serve = start
 
 
-def _refused(door: Door, request: Request) -> Response | None:
-    """What the door answers to a request, or None if it may go on."""
-    answer = door.answer(request.path, dict(request.headers.raw_items()))
-    if answer is None:
-        return None
-    body = answer.body.encode()
-    headers = Headers({**answer.headers, "Content-Length": str(len(body))})
-    return Response(answer.status.value, answer.status.phrase, headers, body)
+def _adapted(response: Response) -> Response:
+    """The answer with mien's script, if it is viser's page. Any other answer stays as it is."""
+    if not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(response.body) if packed else response.body
+    body = body.replace(b"<head>", b"<head>" + _SCRIPT.encode(), 1)
+    body = gzip.compress(body) if packed else body
+    headers = Headers(response.headers.raw_items())
+    del headers["Content-Length"]
+    headers["Content-Length"] = str(len(body))
+    return Response(response.status_code, response.reason_phrase, headers, body)
 
 
 def _check_guard(host: str, port: int) -> None:
