@@ -19,8 +19,6 @@ from mien.machine.terminal import show
 from mien.plugins import named
 
 if TYPE_CHECKING:
-    import torch
-
     StepMethod = str
 else:
     StepMethod = Literal[tuple(STEP_BENCHMARKS)]
@@ -56,9 +54,10 @@ class Render(_Timed):
         """Measure and print the rows."""
         from mien.lab.benchmarking.render import gpu_rows, render_suite
 
-        like = _gpu(self.device)
-        rows = render_suite(self.seconds) if like is None else gpu_rows(like, self.seconds)
-        show_rows(rows, self.as_json, gpu=like is not None)
+        device = choose_device(self.device)
+        on_gpu = device.type == "cuda"
+        rows = gpu_rows(like_on(device), self.seconds) if on_gpu else render_suite(self.seconds)
+        show_rows(rows, self.as_json, gpu=on_gpu)
 
 
 @dataclass(frozen=True)
@@ -119,11 +118,11 @@ class TrainStep(_Timed):
 
             show_rows(parts_suite(self.seconds), self.as_json, as_text=format_parts)
             return
-        like = _gpu(self.device) if self.method in GPU_BENCHMARKS else None
-        if like is None:
-            show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)
+        device = choose_device(self.device)
+        if device.type == "cuda" and self.method in GPU_BENCHMARKS:
+            show_rows(named(GPU_BENCHMARKS[self.method])(like_on(device), self.seconds), self.as_json, gpu=True)
         else:
-            show_rows(named(GPU_BENCHMARKS[self.method])(like, self.seconds), self.as_json, gpu=True)
+            show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)
 
 
 @dataclass(frozen=True)
@@ -193,10 +192,9 @@ class Compare:
             raise UserError("--methods: give at least one method")
         for method in self.methods:
             check_method("--methods", method)
-        roots = [folder.resolve() for folder in self.workspaces]
-        names = [root.name for root in roots] + list(self.captures)
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
+        names = [folder.resolve().name for folder in self.workspaces] + list(self.captures)
+        if len({*names}) < len(names):
+            twice = max(names, key=names.count)
             raise UserError(f"{twice}: two captures have this name; give one of them, or rename its folder")
         for folder in self.workspaces:
             open_workspace(folder)
@@ -216,15 +214,9 @@ class Compare:
 TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
-def _gpu(name: DeviceName) -> "torch.Tensor | None":
-    """A scalar on the chosen GPU, or None for the CPU."""
-    device = choose_device(name)
-    return like_on(device) if device.type == "cuda" else None
-
-
 def show_rows(
-    rows: "Iterable[Any]", as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
-) -> "list[Any]":
+    rows: Iterable[Any], as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
+) -> list[Any]:
     """Print the machine, and each row (or list of rows) once it is measured, or everything as json, with one thread."""
     import torch
 

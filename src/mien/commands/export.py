@@ -114,12 +114,13 @@ def task_of(arguments: Sequence[str]) -> type[Command]:
 
 def _refuse_options_of_others(arguments: Sequence[str], kind: Format, out: str) -> None:
     """Name the formats that have an option which `kind` lacks."""
-    options = {
-        each.name: {f"--{one.name.replace('_', '-')}" for one in fields(each.options())} for each in (*formats(), kind)
-    }
+
+    def options(of: Format) -> set[str]:
+        return {f"--{each.name.replace('_', '-')}" for each in fields(of.options())}
+
     typed = {each.partition("=")[0].replace("_", "-") for each in arguments if each.startswith("--")}
-    for option in sorted(typed - {"--run"} - options[kind.name]):
-        others = [name for name, own in options.items() if option in own]
+    for option in sorted(typed - {"--out", "--format", "--run", "--help", "--help-all"} - options(kind)):
+        others = [each.name for each in formats() if option in options(each)]
         if others:
             raise UserError(f"{out}: {option} is an option of {any_of(others)}, not of {kind.name}; leave it out")
 

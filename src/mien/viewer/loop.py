@@ -46,12 +46,9 @@ class DrawingLoop:
     ) -> None:
         """Make a loop that is not running yet.
 
-        Args:
-            draw: Returns the picture of a view, of half size or full size.
-            advance: Is called before each picture with the time. It changes what plays, and returns when it wants to be
-                called again, or None.
-            clock: Returns the time in seconds.
-            failed: Is called if a picture of one client cannot be drawn or shown; it gets none until something changes.
+        `draw` returns the picture of a view, of half size or full size. `advance` is called before each picture with
+        the time: it changes what plays, and returns when it wants to be called again, or None. `failed` is called if a
+        picture of one client cannot be drawn or shown; it gets none until something changes.
         """
         self._draw, self._advance, self._clock, self._failed = draw, advance, clock, failed
         self._clients: dict[int, _Client] = {}
@@ -130,13 +127,8 @@ class DrawingLoop:
         if waiting:
             key, client = min(waiting, key=lambda item: item[1].served_at)
             return key, client, self._is_quick or now - client.changed_at >= STILL_SECONDS
-        still = [
-            (key, client) for key, client in seen if not client.is_full and now - client.changed_at >= STILL_SECONDS
-        ]
-        if not still:
-            return None
-        key, client = min(still, key=lambda item: item[1].served_at)
-        return key, client, True
+        still = [item for item in seen if not item[1].is_full and now - item[1].changed_at >= STILL_SECONDS]
+        return (*min(still, key=lambda item: item[1].served_at), True) if still else None
 
     def _time(self, seconds: float) -> None:
         """Take account of the time that a full picture took, or would have taken."""

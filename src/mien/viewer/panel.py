@@ -152,19 +152,17 @@ class Panel:
             timeline = self._time = gui.add_slider("Frame", 0, last, 1, 0)
             filmed = gui.add_checkbox("Filmed frame beside it", False)
         self.play_button = play
-        before = [first]
 
         def choose(name: str, client: viser.ClientHandle | None) -> None:
             try:
-                if name != before[0]:
+                if name != (session.chosen or _NOTHING):
                     session.choose(None if name == _NOTHING else name)
-                before[0] = name
                 if self._play_asked and session.clip is not None:
                     session.play(True, time.monotonic())
                 timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
             except (UserError, ImportError) as error:
                 if chosen.value == name:
-                    chosen.value = before[0]
+                    chosen.value = session.chosen or _NOTHING
                 if isinstance(error, ImportError):
                     raise
                 self._complain(client, str(error))
@@ -174,7 +172,7 @@ class Panel:
 
         def load(client: viser.ClientHandle | None) -> None:
             name = chosen.value
-            self._loading = name not in (_NOTHING, before[0])
+            self._loading = name not in (_NOTHING, session.chosen)
             self._name_play()
             self._motions.ask("motion", lambda: choose(name, client))
 
