@@ -4,6 +4,7 @@ import importlib.util
 import json
 import shlex
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -11,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
-from mien.batch.plan import Batch, Options, Row
+from mien.batch.plan import Batch, Options
 from mien.disk.config import Range
 from mien.errors import UserError
 from mien.machine.terminal import show
@@ -95,11 +96,16 @@ class Run:
         from mien.machine.progress import say
         from mien.machine.terminal import counted
 
-        batch, rows = Batch(self.out), read_table(self.table, self.for_all)
+        batch, rows, known = Batch(self.out), read_table(self.table, self.for_all), []
         labels = dict.fromkeys(label for row in rows for label in row.labels)
         if labels:
             say(f"labels, which come back in the results: {', '.join(labels)}")
-        _tell_dropped(batch, rows)
+        with suppress(UserError):  # there is no earlier table, or it is damaged and will be replaced
+            known = [row.name for row in batch.read_plan()]
+        dropped = [name for name in known if name not in {row.name for row in rows}]
+        if dropped:
+            shown = ", ".join(dropped[:5]) + (", ..." if len(dropped) > 5 else "")
+            say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
         batch.write_plan(rows)
         cluster = (self.gpus, self.time, self.partition, self.ray_address)
         options = Options(
@@ -120,21 +126,6 @@ class Run:
             return tuple(shlex.split(self.program))
         except ValueError as error:
             raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
-
-
-def _tell_dropped(batch: Batch, rows: list[Row]) -> None:
-    """Say which rows of an earlier table are no longer in the plan."""
-    from mien.machine.progress import say
-    from mien.machine.terminal import counted
-
-    names = {row.name for row in rows}
-    try:
-        dropped = [row.name for row in batch.read_plan() if row.name not in names]
-    except UserError:  # there is none, or it is damaged and will be replaced
-        return
-    if dropped:
-        shown = ", ".join(dropped[:5]) + (", ..." if len(dropped) > 5 else "")
-        say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
 
 
 @dataclass(frozen=True)

@@ -54,11 +54,9 @@ _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 
 
 def read_table(path: Path, for_all: Sequence[str] = ()) -> list[Row]:
-    """The rows of a table.
+    """The rows of a csv, a json, or a folder of videos.
 
-    Args:
-        path: A csv, a json, or a folder of videos.
-        for_all: Options of `mien create` for all rows, as they were typed. A cell of the table goes first.
+    `for_all` has options of `mien create` for all rows, as they were typed. A cell of the table goes first.
     """
     usual, kinds = _columns_of(for_all), set[str]()
     entries = list(_entries(path))

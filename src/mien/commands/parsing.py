@@ -133,11 +133,8 @@ def explained(
 ) -> type:
     """A class of options whose descriptions are paragraphs, and end with the range, the default and those of presets.
 
-    Args:
-        options: The options with the defaults to show.
-        is_shown: Whether to show an option, by its name such as "capture.size".
-        prefix: Beginning of the names of options.
-        presets: The same options by each preset.
+    `is_shown` says whether to show an option, by its name such as "capture.size", which begins with `prefix`. `presets`
+    has the same options by each preset.
     """
     kind = type(options)
     about, annotations, defaults = field_docs(kind), {}, {}

@@ -25,7 +25,7 @@ from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.draw import draw, posed_softly, warn_of_white
-from mien.pipeline.names import NEUTRALS, Kind, check_driver, check_neutral, is_picture
+from mien.pipeline.names import NEUTRALS, check_driver, check_neutral, is_picture, kind_of
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.track import run_tracking_stage
 from mien.tracking.settings import TrackingSettings
@@ -42,35 +42,28 @@ def open_driver(
 ) -> Driver:
     """Open a driver: a workspace, a recording (csv, json, voice), or a film.
 
-    A film is a video, a picture or a folder of pictures. It is captured, tracked and kept in the cache.
-
-    Args:
-        by: The workspace or file.
-        sequence: Name of a sequence of the workspace. For a video with cuts: one part instead of all parts in a row.
-        face_model: The avatar's face model.
-        fps: Frame rate of the timecode in a csv.
-        neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.drivers.with_neutral`).
-        capture: How a film is captured.
+    A film is a video, a picture or a folder of pictures. It is captured (by `capture`), tracked and kept in the cache.
+    `sequence` is one of a workspace, or a part of a film with cuts, all of which otherwise follow each other; `fps` is
+    the rate of a csv's timecode; `neutral` is the driver's face at rest, as `--neutral` names it (`with_neutral`).
     """
-    kind = check_driver(by, sequence, fps, capture)
     check_neutral(neutral)
-    driver = _open(kind, by, face_model, sequence, fps, capture)
-    if neutral is None and kind == "film" and by.is_file() and is_picture(by):
+    driver, other = _open(by, face_model, sequence, fps, capture), None
+    if neutral is None and by.is_file() and kind_of(by) == "film" and is_picture(by):
         say(f"{by}: is one picture, so its motion is measured from the face model's neutral")
         neutral = "model"
-    rest = None if neutral is None or neutral in NEUTRALS else Path(neutral)
-    other = None if rest is None else _open(check_driver(rest), rest, face_model)
+    if neutral is not None and neutral not in NEUTRALS:
+        other = _open(Path(neutral), face_model)
     return with_neutral(driver, face_model, neutral, str(by), other)
 
 
 def _open(
-    kind: Kind,
     by: Path,
     face_model: FaceModel,
     sequence: str | None = None,
     fps: float | None = None,
     capture: CaptureSettings | None = None,
 ) -> Driver:
+    kind, names = check_driver(by, sequence, fps, capture), None
     if kind == "recording":
         return read_recording(by, face_model, fps)
     if kind == "sequence":
@@ -78,7 +71,7 @@ def _open(
     if kind == "film":
         workspace, names = tracked_film(by, face_model.name, capture)
     else:
-        workspace, names = open_workspace(by), None
+        workspace = open_workspace(by)
     if names is None or sequence is not None:
         names = [workspace.pick_sequence(sequence)]
     return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)

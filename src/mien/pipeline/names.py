@@ -166,7 +166,7 @@ def check_driver(
         raise UserError(f"--fps {fps:g}: is for the times of a .csv; give a number above 0, at most 1000")
     if not by.exists():
         raise UserError(f"{by}: no such file or folder; give {_DRIVERS}")
-    kind, settings = _kind_of(by), capture or usual
+    kind, settings = kind_of(by), capture or usual
     if kind == "recording" and sequence is not None:
         raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
     if kind != "film" and settings != usual:
@@ -201,7 +201,8 @@ def check_neutral(neutral: str | None) -> None:
     check_driver(Path(neutral))
 
 
-def _kind_of(by: Path) -> Kind:
+def kind_of(by: Path) -> Kind:
+    """What something is that drives an avatar."""
     if by.is_file():
         return "recording" if by.suffix.lower() in (".csv", ".json", *SOUND_ENDINGS) else "film"
     if (by / "tracking").is_dir():

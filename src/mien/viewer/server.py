@@ -81,7 +81,8 @@ class Serving:
         self.port = int(listener.getsockname()[1])
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
-        with _quiet(), _guarded(door, listener):
+        # viser prints on standard output.
+        with contextlib.redirect_stdout(io.StringIO()), _guarded(door, listener):
             self.server = viser.ViserServer(host=door.host, port=self.port, label="mien", verbose=False)
         try:
             _check_guard(door.host, self.port)
@@ -90,7 +91,7 @@ class Serving:
             self.server.get_event_loop().set_exception_handler(self._task_failed)
             self._show(title)
         except BaseException:
-            with _quiet():
+            with contextlib.redirect_stdout(io.StringIO()):
                 self.server.stop()
             raise
         self.address = address_of(door, listener)
@@ -108,7 +109,7 @@ class Serving:
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         self.panel.stop()
         self.loop.stop()
-        with _quiet():
+        with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def _show(self, title: str) -> None:
@@ -218,13 +219,6 @@ def address_of(door: Door, listener: socket.socket) -> str:
     """The address that people open to reach a socket."""
     host = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
     return door.address(host, int(listener.getsockname()[1]))
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Drop what viser prints on standard output."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
 
 
 @contextlib.contextmanager
