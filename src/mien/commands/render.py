@@ -115,11 +115,16 @@ class Render(_Look):
         from mien.media.writing import write_pictures
         from mien.pipeline.draw import draw, posed_softly, sides_filmed, warn_of_white
         from mien.pipeline.expression import chosen_face
+        from mien.training.footage.sequence import read_sequence
+        from mien.training.run import read_face_track
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        avatar = load_avatar(run_dir)
-        motion = self._motion(workspace, run_dir, avatar.face_model)
+        avatar, motion = load_avatar(run_dir), None
+        if self.motion == "own":
+            motion = read_face_track(run_dir, avatar.face_model)
+        elif self.motion is not None:
+            motion = read_sequence(workspace.sequence_dir(self.motion)).tracking.face
         face = chosen_face(run_dir, avatar, motion, self.timestep, self.set)
         moves = motion is not None and self.timestep is None
         cameras = self._cameras(workspace, run_dir, avatar, face, len(face) if moves else None)
@@ -145,16 +150,6 @@ class Render(_Look):
     @property
     def _sequence(self) -> str | None:
         return None if self.motion == "own" else self.motion
-
-    def _motion(
-        self, workspace: Workspace, run_dir: Path, model: "mien.face.FaceModel"
-    ) -> "mien.face.FaceParams | None":
-        from mien.training.footage.sequence import read_sequence
-        from mien.training.run import read_face_track
-
-        if self.motion == "own":
-            return read_face_track(run_dir, model)
-        return None if self.motion is None else read_sequence(workspace.sequence_dir(self.motion)).tracking.face
 
     def _cameras(
         self,

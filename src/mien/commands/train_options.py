@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 else:
     PresetName = Literal[tuple(PRESETS)]
 
-_MOST_BYTES = 16 << 20
-"""Largest file of settings. A run's config.json has some kilobytes."""
 _TAKEN = ("method", "settings")
 _NOT_TAKEN = ("format", "version", "checksum", "data", "mien", "command_line")
 """Other entries of a run's config.json: what it was trained on, by which version, with which command."""
@@ -68,9 +66,7 @@ class ConfigFile:
     method: str | None
     """Name of the method, if the file gives one."""
     method_changes: Mapping[str, Any]
-    """The method's settings by name, without `kind`."""
     settings_changes: Mapping[str, Any]
-    """Settings of the run by name."""
     sequences: tuple[str, ...]
     """Sequences that the run of this file was trained on. They are not taken over."""
 
@@ -221,7 +217,7 @@ def _read(path: Path) -> dict[str, Any]:
         what = "is a folder" if path.is_dir() else "is not an ordinary file" if path.exists() else "no such file"
         raise UserError(f"--config {path}: {what}; give a json file, such as DIR/runs/NAME/config.json")
     try:
-        text = read_bytes(path, _MOST_BYTES).decode("utf-8-sig")  # editors on Windows write a byte order mark
+        text = read_bytes(path, 16 << 20).decode("utf-8-sig")  # editors on Windows write a byte order mark
         content = parse_json(text, unique_names=True, any_size=True)
     except (OSError, ValueError) as error:
         raise UserError(f"--config {path}: cannot be read as json ({error}); correct it or give another file") from None
