@@ -26,7 +26,7 @@ from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import l1
 from mien.face import FaceModel, FaceParams
 from mien.pipeline.drive import open_driver
-from mien.pipeline.driver import name_neutral
+from mien.pipeline.names import check_neutral
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import read_tracking
 from mien.training import TrainSettings, train
@@ -365,7 +365,7 @@ def test_the_option_of_every_command(tmp_path: Path) -> None:
     ):  # fmt: skip
         driver = open_driver(workspace, None, toy_face_model(), neutral=neutral)
         assert float(driver.at_rest.expression[0, 0]) == pytest.approx(expected, abs=1e-6), neutral
-    refuses(r"--neutral rest: no such file; give first, calm or model", name_neutral, "rest")
+    refuses(r"--neutral rest: no such file; give first, calm or model", check_neutral, "rest")
     with pytest.raises(UserError, match="was tracked with another face model"):
         open_driver(recorded(tmp_path / "a.csv", 3), None, model(), neutral=str(still))
     # The zero of a recording's coefficients is the recorder's neutral; its head may be turned throughout.

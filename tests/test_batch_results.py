@@ -175,12 +175,12 @@ def test_json_and_a_folder_of_videos_are_tables_as_well(table: Path):
 
 
 def test_options_of_create_count_for_all_rows_and_a_cell_goes_first(table: Path, tmp_path: Path):
-    typed = ["people.csv", "--steps", "30", "--out", "people", "--no-face-tuning", "--capture.size=256"]
+    typed = ["people.csv", "--steps", "30", "--out", "people", "--capture.no-cuts", "--capture.size=256"]
     typed += ["--method", "textured_mesh", "--training.resolution", "96"]
     command = parse(batch_command, "batch", typed)
     assert (command.table, command.out) == (Path("people.csv"), Path("people"))
     ann, bob = (row.steps[0] for row in read_table(table, command.for_all))
-    more = ("--no-face-tuning", "--capture.size", "256", "--training.resolution", "96")
+    more = ("--capture.no-cuts", "--capture.size", "256", "--training.resolution", "96")
     made = ("--out", "{workspace}", "--method")
     assert ann == ("create", str(tmp_path / "ann.mp4"), *made, "gaussian_avatars", "--steps", "60", *more)
     assert bob == ("create", str(tmp_path / "bob.mp4"), *made, "textured_mesh", "--steps", "30", *more)
@@ -198,9 +198,8 @@ def test_wrong_options_of_all_rows_are_named(table: Path, capsys: Any, options: 
 
 
 @pytest.mark.parametrize(("column", "typed"), [
-    (("face_tuning", "no"), ("--no-face-tuning",)),
-    (("face_tuning", "yes"), ()),
     (("capture.cuts", "no"), ("--capture.no-cuts",)),
+    (("capture.cuts", "yes"), ()),
     (("track_apart", "no"), ()),
     (("method.face-tuning.enabled", "no"), ("--method.face-tuning.enabled", "False")),
 ])  # fmt: skip

@@ -25,7 +25,6 @@ from mien.lab.synthetic.recipe import Segment
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.lab.synthetic.truth import Truth, truth_of
 from mien.pipeline import comparing
-from mien.pipeline.comparing import Budget, CompareSettings
 from mien.render.mesh import vertex_normals
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.tracking import Tracking
@@ -121,22 +120,21 @@ def test_what_two_trials_share_is_not_counted_for_each_step(workspace: Path, tmp
         return times[settings.steps]
 
     monkeypatch.setattr(comparing, "trial_seconds", trial)
-    chosen = CompareSettings(("gaussian_avatars",), Budget(minutes=2.0), "tail")
-    subject = comparing.of_workspace(Workspace(workspace), chosen)
+    subject = comparing.of_workspace(Workspace(workspace), "tail")
     config = PRESETS["standard"].config("gaussian_avatars")
 
-    def steps_for(budget: Budget) -> int:
-        return comparing.steps_for(subject, config, subject.settings, budget, tmp_path / "new")
+    def steps_for(minutes: float = 0.0, steps: int = 0) -> int:
+        return comparing.steps_for(subject, config, subject.settings, minutes, steps, tmp_path / "new")
 
-    assert steps_for(chosen.budget) == 114 / 0.04  # 6 s beside the steps, and 40 ms for each
+    assert steps_for(2.0) == 114 / 0.04  # 6 s beside the steps, and 40 ms for each
     assert asked == [100, 200]
     times[200] = 9.0  # The machine was busier in the first trial: a step takes at least 0.3 of the mean.
-    assert steps_for(chosen.budget) == round(113.7 / 0.0135)
-    assert steps_for(Budget(minutes=0.2)) == 120  # There is no time for a second trial.
+    assert steps_for(2.0) == round(113.7 / 0.0135)
+    assert steps_for(0.2) == 120  # There is no time for a second trial.
     assert "too few steps" not in capsys.readouterr().err
-    assert steps_for(Budget(minutes=0.002)) == 1
+    assert steps_for(0.002) == 1
     assert "0.002 minutes are too few steps to see each of" in capsys.readouterr().err
-    assert (steps_for(Budget(steps=7)), steps_for(Budget())) == (7, subject.settings.steps)
+    assert (steps_for(steps=7), steps_for()) == (7, subject.settings.steps)
 
 
 def row(capture: str, method: str, psnr: float, unseen: dict[str, Any] | None = None, **parts: Any) -> MethodRow:

@@ -76,7 +76,7 @@ def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(("line", "told"), [
     ("scaling --plot chart.jpg", "charts are written as .svg"),
     ("train-step --parts --method headgas", "--parts --method headgas"),
-    ("train-step --seconds=0", "--seconds 0: give a positive number"),
+    ("train-step --seconds=0", "--seconds 0: give a number above 0"),
 ])  # fmt: skip
 def test_what_cannot_be_measured_is_told_at_once(line: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert told in complaint(capsys, "bench", *line.split())

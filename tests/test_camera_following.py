@@ -27,8 +27,8 @@ from mien.media.video import probe_video, read_video_frames, write_video
 from mien.pipeline import view_motions as viewing_motions
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime import write_portable
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import View
-from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
 from mien.viewer.session import Seen, Session
 from refusals import complaint, refuses

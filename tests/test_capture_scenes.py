@@ -104,7 +104,7 @@ def misses(capture_dir: Path, truth: np.ndarray) -> np.ndarray:
 
 def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch):
     workspace, settings, names = Workspace(tmp_path), CaptureSettings(size=160), ["clip-1", "clip-2"]
-    assert run_capture_stage(workspace, shots, None, settings) == names
+    assert run_capture_stage(workspace, [shots], (), None, settings) == names
     said = capsys.readouterr().err
     assert "cuts to another shot at 1.1, 1.4, 2.5 s" in said
     assert "1 parts shorter than 1 s are left out, at 1.1 s" in said
@@ -125,7 +125,7 @@ def test_each_long_shot_becomes_a_sequence(shots, tmp_path, capsys, monkeypatch)
     assert crops[0] != crops[1]
     # Functions that would work again are not called.
     monkeypatch.setattr("mien.capture.from_video.survey_source", None)
-    assert run_capture_stage(workspace, shots, None, settings) == names
+    assert run_capture_stage(workspace, [shots], (), None, settings) == names
 
 
 def test_cuts_can_be_ignored_and_short_parts_kept(shots, tmp_path, capsys):

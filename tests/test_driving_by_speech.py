@@ -1,5 +1,6 @@
 """A voice drives an avatar: silence, loudness, high and low sounds, and the sound in the video."""
 
+import socket
 import wave
 from pathlib import Path
 
@@ -212,7 +213,8 @@ def test_without_an_output_the_viewer_plays_the_voice(tmp_path: Path, monkeypatc
     write_toy_workspace(tmp_path / "w")
     voice, shown, face = write_wav(tmp_path / "voice.wav", tone(300.0)[0]), [], toy_face_model().neutral(90)
 
-    def serve(session: Session, door: object, port: int, *rest: object) -> None:
+    def serve(session: Session, door: object, listener: socket.socket, *rest: object) -> None:
+        port = listener.getsockname()[1]
         shown.append((session.chosen, session.playing, session.clip is not None and len(session.clip.motion), port))
 
     monkeypatch.setattr(viewing, "serve", serve)

@@ -76,7 +76,7 @@ OF_A_VIDEO = {
     "capture": "{video} --out {out}/captured",
     "track": "{out}/captured " + " ".join(TRACK),
     "align": "{out}/captured --alignment.template-steps 2 --alignment.iterations 1",
-    "create": "{video} --out {out}/captured --preset draft --steps 2 --alignment.when never " + " ".join(TRACK),
+    "create": "{video} --out {out}/captured --preset draft --steps 2 --tracking.schedule landmarks",
     "batch": "{table} --out {out}/batch --program {stub}",
 }
 OF_A_RUN = {

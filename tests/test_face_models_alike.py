@@ -40,7 +40,7 @@ from mien.render.mesh import render_mesh
 from mien.runtime import load as load_portable
 from mien.tracking import read_tracking, track
 from mien.tracking.landmarks import embedding
-from mien.tracking.landmarks.detector_response import read_response
+from mien.tracking.landmarks.detector_response import OFFSET_SIGMA, read_response
 from mien.tracking.landmarks.embedding import EmbeddingSettings
 from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS
 from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
@@ -133,7 +133,7 @@ def _moving(model: FaceModel, timesteps: int) -> FaceParams:
 def _as_detected(model: FaceModel, face: FaceParams) -> Tensor:
     """Landmarks in the world, with the offsets that the detector was measured to have on this model.
     Only anny was measured. Its fit takes these offsets away, so landmarks without them are not those of a picture."""
-    response, double = read_response(model, TrackingSettings.bias_sigma), face.to(torch.zeros((), dtype=torch.float64))
+    response, double = read_response(model, OFFSET_SIGMA), face.to(torch.zeros((), dtype=torch.float64))
     offsets = response.mean + response.of_turns(double.head_rotation)
     offsets = offsets + torch.einsum("be,elc->blc", double.expression, response.by_expression)
     pose = double.T_world_head

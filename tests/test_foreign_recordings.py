@@ -200,7 +200,7 @@ def test_a_take_with_what_systems_leave_is_recognised_also_in_a_hidden_folder(tm
 def test_pictures_drive_an_avatar(tmp_path: Path, monkeypatch, names: tuple[str, ...], count: int, whole: bool) -> None:
     """A picture, or a folder of few, is repeated, because tracking needs three frames."""
     captured: list[Path] = []
-    monkeypatch.setattr(driving, "run_capture_stage", lambda _, source, *__: captured.extend(list_images(source)))
+    monkeypatch.setattr(driving, "run_capture_stage", lambda _, sources, *__: captured.extend(list_images(sources[0])))
     monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
     monkeypatch.setattr(driving, "cache_folder", lambda: tmp_path / "cache")
     folder = given(tmp_path / "people", *names)

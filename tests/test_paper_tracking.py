@@ -182,7 +182,7 @@ def test_landmarks_cost_what_they_cost_other_schedules(case, monkeypatch):
     })  # fmt: skip
     descent, (own,) = Descent(scene, first_state(scene, fit)), fit.sequences
     target = read_target(scene, 0, 3, 0)
-    term = quiet_landmarks(all_landmarks(model, shot.views, own, settings), settings.paper.landmark_share)
+    term = quiet_landmarks(all_landmarks(model, shot.views, own, settings))
     expected = term.cost(own.state, fit.subject, own.cameras)[3]
     found = landmark_terms(scene, target, descent.moving(target, ())[0]) + prior_term(scene, descent.state.frames[0][3])
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=0)

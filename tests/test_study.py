@@ -206,7 +206,7 @@ def test_bad_answers_are_told_in_one_line(page: Path, tmp_path: Path, capsys: py
     bad.write_text(json.dumps(good))
     for key_file, answers, told in (
         (key, tmp_path, "is of participant 00000001"), (key, gone, "gone.json: no such file"),
-        (gone, tmp_path, "gone.json: missing"), (tmp_path / "good.json", tmp_path, "expected 'mien.study_key'"),
+        (gone, tmp_path, "no such file; give the key"), (tmp_path / "good.json", tmp_path, "expected 'mien.study_key'"),
         (key, page.parent, "has no answer file"),
     ):  # fmt: skip
         refused(capsys, told, "tally", key_file, answers)

@@ -252,7 +252,7 @@ def test_help_and_names_are_printed_in_any_locale() -> None:
         assert path.read_bytes().isascii(), f"{path}: run `make setup`"
     help_of_all = "from mien.cli import main; main(['bench', '--help-all'])"
     assert "mien bench" in run_python(["-c", help_of_all], ASCII)
-    odd = "from mien import cli; cli.GROUPS['\\udcff \\u2022'] = (); cli.main([])"
+    odd = "from mien import cli; cli.GROUPS['\\udcff \\u2022'] = {}; cli.main([])"
     assert "\\xff \u2022:" in run_python(["-c", odd], {"LC_ALL": "C.UTF-8"})
 
 

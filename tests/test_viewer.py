@@ -46,8 +46,8 @@ def front_view(avatar: runtime.Avatar, width: int = 96, height: int = 64) -> Vie
 
 
 def test_sliders_and_random_faces_change_the_face_within_bounds(session: Session) -> None:
-    changes: list[int] = []
-    session.changed = lambda: changes.append(session.version)
+    changes: list[None] = []
+    session.changed = lambda: changes.append(None)
     names, joint = session.avatar.expression_names, session.avatar.joint_names[0]
     index = names.index("jawOpen")
     for asked, shown in ((0.5, 0.5), (7.0, session.avatar.portable.expression_bounds[index, 1])):
@@ -65,7 +65,7 @@ def test_sliders_and_random_faces_change_the_face_within_bounds(session: Session
     session.take_random(np.random.default_rng(0))
     session.rest()
     np.testing.assert_array_equal(session.face.expression, session.avatar.portable.neutral.expression)
-    assert (len(changes), changes) == (6, sorted(changes))
+    assert len(changes) == 6
     portable = session.avatar.portable
     eye = np.eye(len(portable.neutral.expression) + portable.neutral.joints.size, dtype=np.float32)
     limits = runtime.Filmed(0 * eye[0], 0 * eye[0], eye, np.ones(1, np.float32), np.ones((2, 2), np.float32))
@@ -243,7 +243,7 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, made_once: MadeOnce, caps
     for words, *arguments in (
         ("no such file", tmp_path / "gone.mien"), ("is no .mien file", __file__), ("cut.mien: is damaged", cut),
         ("leave --run out", file, "--run", "toy"), ("no run 'x'", workspace, "--run", "x"),
-        ("from 1 to 65535", workspace, "--port", "65536"),
+        ("from 0 to 65535", workspace, "--port", "65536"),
         ("gone.csv: no such file", workspace, "--play", "gone.csv"),
         ("--no-token: other machines can reach --host 0.0.0.0", file, "--host", "0.0.0.0", "--no-token"),
         ("--host nowhere.invalid: is no address of this machine", workspace, "--host", "nowhere.invalid"),

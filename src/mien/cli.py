@@ -11,6 +11,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import mien
@@ -22,43 +23,45 @@ from mien.machine.threads import asked_threads, use_one_torch_thread
 from mien.plugins import missing_package
 
 GROUPS = {
-    "Make an avatar": ("demo", "create", "capture", "track", "align", "train", "import", "batch"),
-    "Use it": ("view", "render", "drive", "export", "export-dataset"),
-    "Research": ("evaluate", "analyze", "study", "bench", "face-models", "licenses", "plugins"),
+    "Make an avatar": {
+        "demo": "the whole path on a synthetic head, in minutes: start here",
+        "create": "video -> avatar, page, film and report: all stages in one command",
+        "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
+        "track": "capture -> face parameters, cameras, overlay video",
+        "align": "trackings -> sharper ones: every frame fitted to a quick avatar",
+        "train": "captures + trackings -> an avatar, by the method of your choice",
+        "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
+        "batch": "a table of captures -> an avatar each, here, on Slurm or on Ray",
+    },
+    "Use it": {
+        "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
+        "render": "avatar -> a still or a video along a camera path, at any expression",
+        "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
+        "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
+        "export-dataset": "capture -> the layout of another laboratory, or the videos of the NeRSemble benchmark",
+    },
+    "Research": {
+        "evaluate": "avatar -> metrics.json and report.html on held-out frames",
+        "analyze": "avatar -> the figures of its method's paper, measured: growth, speed, ablations",
+        "study": "runs -> a page on which people compare them blind; answers -> percentages",
+        "bench": "speed of this machine; quality on reference captures with known truth",
+        "face-models": "list the face models and bake them ahead of time",
+        "licenses": "what is installed, under which terms, and what that means",
+        "plugins": "what other packages add: methods, formats and datasets, and their faults",
+    },
 }
-"""The sub-commands as `mien --help` lists them."""
-COMMANDS = {
-    "create": "video -> avatar, page, film and report: all stages in one command",
-    "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
-    "track": "capture -> face parameters, cameras, overlay video",
-    "align": "trackings -> sharper ones: every frame fitted to a quick avatar",
-    "train": "captures + trackings -> an avatar, by the method of your choice",
-    "evaluate": "avatar -> metrics.json and report.html on held-out frames",
-    "analyze": "avatar -> the figures of its method's paper, measured: growth, speed, ablations",
-    "study": "runs -> a page on which people compare them blind; answers -> percentages",
-    "render": "avatar -> a still or a video along a camera path, at any expression",
-    "drive": "avatar + the motion of a video, a sequence, a phone or MediaPipe -> video",
-    "view": "avatar -> a viewer in the browser: turn it, move its face, play a motion",
-    "export": "avatar -> .mien (runs without torch), .html, .glb, Gaussians in a pose, or GaussianAvatars' folder",
-    "export-dataset": "capture -> the layout of another laboratory, or the videos of the NeRSemble benchmark",
-    "import": "files of other programs (GaussianAvatars' folder) -> an avatar, or sequences to train on",
-    "batch": "a table of captures -> an avatar each, here, on Slurm or on Ray",
-    "face-models": "list the face models and bake them ahead of time",
-    "bench": "speed of this machine; quality on reference captures with known truth",
-    "licenses": "what is installed, under which terms, and what that means",
-    "plugins": "what other packages add: methods, formats, datasets and engines, and their faults",
-    "demo": "the whole path on a synthetic head, in minutes: start here",
-}
-"""Name -> summary. `mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`.
+"""The sub-commands with their summaries, as `mien --help` lists them.
 
-`check()` checks options and paths as far as that is possible without heavy libraries; `run()` then does the work.
+`mien.commands.NAME` (dashes become underscores) holds the dataclass `Command`. Its `check()` checks options and paths
+as far as that is possible without heavy libraries; `run()` then does the work.
 """
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+_ROW = "batch-row"
+"""The hidden command that is the process of one row of a batch (`mien.batch.row`): its steps are commands of mien."""
 
 EXIT_USER_ERROR = 2
 EXIT_CLOSED_PIPE = 141
 """Exit code of a program that the system ends because nobody reads its output any more (`mien ... | head -1`)."""
-_OPENCVS_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
-"""OpenCV reads this variable when it is imported."""
 _USERS_ERRNOS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG}
 )
@@ -121,6 +124,10 @@ def _dispatch(arguments: list[str]) -> int:
         show(f"mien {mien.__version__}")
         return 0
     name, rest = arguments[0], arguments[1:]
+    if name == _ROW and rest:
+        from mien.batch.row import do_steps, row_process
+
+        return row_process(Path(rest[0]), sys.stdin, partial(do_steps, main))
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, [*COMMANDS, "--help", "--version"], 1)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(COMMANDS)}"
@@ -131,22 +138,10 @@ def _dispatch(arguments: list[str]) -> int:
     for argument in rest:
         if argument.startswith("--") and argument.endswith("="):
             raise UserError(f"{argument} is empty (an unset variable?); give it a value")
-    return _run(name, rest)
-
-
-def _crash() -> int:
-    """Report that it is a bug, and write the traceback to a file."""
-    log = _write_crash_log()
-    tell(f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}")
-    tell(f"mien: the traceback is in {log}; please report it with the command")
-    return 1
-
-
-def _run(name: str, arguments: list[str]) -> int:
-    os.environ.setdefault(_OPENCVS_LIMIT, str(MAX_SIDE**2))
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_SIDE**2))  # OpenCV reads it when it is imported
     modules = ("parsing", name.replace("-", "_"))
     parsing, module = (importlib.import_module(f"mien.commands.{each}") for each in modules)
-    command = parsing.parse(module, name, arguments)
+    command = parsing.parse(module, name, rest)
     asked_threads()
     if hasattr(command, "check"):
         command.check()
@@ -162,11 +157,19 @@ def _run(name: str, arguments: list[str]) -> int:
     return 0
 
 
+def _crash() -> int:
+    """Report that it is a bug, and write the traceback to a file."""
+    log = _write_crash_log()
+    tell(f"mien: this is a bug in mien, not your mistake: {traceback.format_exc().splitlines()[-1]}")
+    tell(f"mien: the traceback is in {log}; please report it with the command")
+    return 1
+
+
 def _overview() -> str:
     width = max(len(name) for name in COMMANDS)
     rows = "\n\n".join(
-        "\n".join([f"{title}:", *(f"  {name:<{width}}  {COMMANDS[name]}" for name in names)])
-        for title, names in GROUPS.items()
+        "\n".join([f"{title}:", *(f"  {name:<{width}}  {summary}" for name, summary in commands.items())])
+        for title, commands in GROUPS.items()
     )
     return (
         f"mien {mien.__version__}: video of a head in, an animatable avatar of 3D Gaussians out.\n\n"

@@ -90,8 +90,8 @@ class Options:
     """How often a failed row is tried again."""
     store: str = ""
     """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
-    program: tuple[str, ...] = (sys.executable, "-m", "mien.commands.batch_row")
-    """The command of a row's process."""
+    program: tuple[str, ...] = (sys.executable, "-m", "mien.cli", "batch-row")
+    """The command of a row's process: `mien batch-row`, by this Python."""
 
 
 Work = Callable[[Row], Any]

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import shlex
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -11,11 +12,12 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
-from mien.batch.plan import Batch, Options, Row
+from mien.batch.plan import Batch, Options
+from mien.disk.config import Range
 from mien.errors import UserError
 from mien.machine.terminal import show
 
-_WATCH_SECONDS = 5.0
+_COUNT = Range(0, 100_000)
 
 
 @dataclass(frozen=True)
@@ -39,25 +41,25 @@ class Run:
     """The engine that runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
     shard: str = ""
     """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
-    retry: int = 2
+    retry: Annotated[int, _COUNT] = 2
     """How often a failed row is tried again."""
-    jobs: int = 0
+    jobs: Annotated[int, _COUNT] = 0
     """Largest number of rows at once. 0 means as many as memory and cores allow."""
-    threads: int = 0
+    threads: Annotated[int, _COUNT] = 0
     """Threads of each row. 0 shares the cores out, or asks a cluster for two."""
-    gpus: float = 0.0
+    gpus: Annotated[float, Range(0, 64)] = 0.0
     """GPUs of each row, on Slurm and Ray."""
     partition: str = ""
     """Partition of Slurm."""
-    time: int = 0
+    time: Annotated[int, _COUNT] = 0
     """Time limit of a row in minutes, for Slurm. 0 means three times the longest finished row, at first a day."""
     ray_address: str = ""
     """Address of a Ray cluster (default: RAY_ADDRESS, or a Ray that is started here)."""
     store: str = ""
     """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
     program: str = ""
-    """Command that runs a row on a node, such as "apptainer exec mien.sif python -m mien.commands.batch_row". The
-    folder of the batch follows it."""
+    """Command that runs a row on a node, such as "apptainer exec mien.sif mien batch-row". The folder of
+    the batch follows it."""
     for_all: Annotated[tuple[str, ...], tyro.conf.Fixed, tyro.conf.Suppress] = ()
     """Options of `mien create`."""
 
@@ -72,11 +74,6 @@ class Run:
         if module is not None and importlib.util.find_spec(module) is None:
             raise ModuleNotFoundError(f"No module named {module!r}", name=module)
         check_writable(self.out, folder=True)
-        for name, value in (("retry", self.retry), ("jobs", self.jobs), ("threads", self.threads), ("time", self.time)):
-            if not 0 <= value <= 100_000:
-                raise UserError(f"--{name} {value}: give a number from 0 to 100000")
-        if not 0 <= self.gpus <= 64:
-            raise UserError(f"--gpus {self.gpus:g}: give a number from 0 to 64")
         if self.shard:
             shard_of([], self.shard)
         if self.store and "://" not in self.store:
@@ -98,11 +95,16 @@ class Run:
         from mien.machine.progress import say
         from mien.machine.terminal import counted
 
-        batch, rows = Batch(self.out), read_table(self.table, self.for_all)
+        batch, rows, known = Batch(self.out), read_table(self.table, self.for_all), []
         labels = dict.fromkeys(label for row in rows for label in row.labels)
         if labels:
             say(f"labels, which come back in the results: {', '.join(labels)}")
-        _tell_dropped(batch, rows)
+        with suppress(UserError):  # there is no earlier table, or it is damaged and will be replaced
+            known = [row.name for row in batch.read_plan()]
+        dropped = [name for name in known if name not in {row.name for row in rows}]
+        if dropped:
+            shown = ", ".join(dropped[:5]) + (", ..." if len(dropped) > 5 else "")
+            say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
         batch.write_plan(rows)
         cluster = (self.gpus, self.time, self.partition, self.ray_address)
         options = Options(
@@ -125,21 +127,6 @@ class Run:
             raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 
 
-def _tell_dropped(batch: Batch, rows: list[Row]) -> None:
-    """Say which rows of an earlier table are no longer in the plan."""
-    from mien.machine.progress import say
-    from mien.machine.terminal import counted
-
-    names = {row.name for row in rows}
-    try:
-        dropped = [row.name for row in batch.read_plan() if row.name not in names]
-    except UserError:  # there is none, or it is damaged and will be replaced
-        return
-    if dropped:
-        shown = ", ".join(dropped[:5]) + (", ..." if len(dropped) > 5 else "")
-        say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
-
-
 @dataclass(frozen=True)
 class Status:
     """Show how far each row of a batch is, what failed and why, and when all will be done."""
@@ -160,7 +147,7 @@ class Status:
             show(json.dumps(found, indent=1) if self.as_json else progress_text(found))
             if not self.watch or not set(found["counts"]) & {"waiting", "running", "interrupted"}:
                 return
-            time.sleep(_WATCH_SECONDS)
+            time.sleep(5)
 
 
 @dataclass(frozen=True)

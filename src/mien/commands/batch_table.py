@@ -6,7 +6,6 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,14 @@ from mien.avatar.methods import DEFAULT_METHOD
 from mien.batch.plan import WORKSPACE, Row, with_fingerprint
 from mien.batch.results import RESULT_COLUMNS
 from mien.batch.store import is_url
-from mien.capture.settings import CaptureSettings
 from mien.commands import create, train
-from mien.commands.parsing import parse_options
-from mien.commands.train_options import Details, TrainOptions, check_method
+from mien.commands.parsing import options_of, parse_options, with_defaults
+from mien.commands.train_options import check_method
 from mien.disk.inside import is_plain_name, listed
 from mien.disk.reading import parse_json, read_bytes
 from mien.disk.tables import table_rows, text_of, with_point
 from mien.disk.workspace import check_no_workspace
 from mien.errors import UserError
-from mien.tracking.settings import ScoringSettings, TrackingSettings
-from mien.training.settings import AlignmentSettings
 
 _MAX_TABLE_BYTES = 64 << 20
 _VIDEOS = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"})
@@ -32,7 +28,7 @@ _OWN = ("name", "video", "videos", "dataset", "method", "methods", "memory-gb")
 """Columns that are no options."""
 _OF_BATCH = {
     "out": "the row's workspace is rows/NAME in the folder of the batch, so leave that column out",
-    "run-name": "a run has the name of its method, so leave that column out",
+    "run": "a run has the name of its method, so leave that column out",
     "view": "nobody watches the rows of a batch, so leave that column out",
 }
 """Options of `mien create` that are no columns -> why."""
@@ -42,25 +38,13 @@ _PATHS = frozenset(
 """Options that name a file. It may be given beside the table."""
 _OF_IMPORT, _OF_SCORES = ("face-model", "retrack"), ("protocol",)
 """Options of `mien import` and of `mien evaluate` that the row of a dataset may have."""
-_GROUPS = {
-    "capture": CaptureSettings,
-    "tracking": TrackingSettings,
-    "alignment": AlignmentSettings,
-    "scoring": ScoringSettings,
-    "training": Details,
-    "method": None,
-}
-"""Group of options -> its settings. Those of methods differ."""
-_OF_TRAIN = {one.name.replace("_", "-") for one in fields(TrainOptions)} - {"method", "training", "method-settings"}
-_OF_CREATE = {one.name.replace("_", "-") for one in fields(create.Command)} - {
-    *_OF_BATCH, *_GROUPS, "videos", "preview", "options", "name"}  # fmt: skip
-_FLAGS_ON = {
-    f"{group}.{one.name.replace('_', '-')}"
-    for group, kind in _GROUPS.items()
-    for one in (fields(kind) if kind else ())
-    if one.default is True
-} | {"face-tuning"}
-"""Flags that are on unless they are turned off: --no-face-tuning, --capture.no-cuts."""
+_OF_TRAIN, _OF_CREATE = (
+    {name: value for name, value in options_of(with_defaults(command, [])) if not name.startswith("method")}
+    for command in (train.Command, create.Command)
+)
+"""Options of both commands with their defaults, but for those of methods, which differ."""
+_OPTIONS = _OF_CREATE.keys() - {"out", "name", "run", "view", "preview"} | {*_OF_IMPORT, *_OF_SCORES}
+_GROUPS = {"method"} | {name.partition(".")[0] for name in _OPTIONS if "." in name}
 _NO = re.compile(r"(^|\.)no-")
 _NUMBER = re.compile(r"-[0-9.]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 _DECIMAL = re.compile(r"-?[0-9]+,[0-9]+")
@@ -70,11 +54,9 @@ _LEAST_MB, _FRAME_MB = 2000.0, 0.1
 
 
 def read_table(path: Path, for_all: Sequence[str] = ()) -> list[Row]:
-    """The rows of a table.
+    """The rows of a csv, a json, or a folder of videos.
 
-    Args:
-        path: A csv, a json, or a folder of videos.
-        for_all: Options of `mien create` for all rows, as they were typed. A cell of the table goes first.
+    `for_all` has options of `mien create` for all rows, as they were typed. A cell of the table goes first.
     """
     usual, kinds = _columns_of(for_all), set[str]()
     entries = list(_entries(path))
@@ -103,7 +85,7 @@ def _columns_of(words: Sequence[str]) -> dict[str, list[str]]:
     _check_names(columns, "options of all rows")
     for column, found in columns.items():
         if column in {*_OWN} - {"method", "memory-gb"} or not (column in _OWN or _is_option(column)):
-            near = difflib.get_close_matches(column, _known(), 1)
+            near = difflib.get_close_matches(column, sorted(_OPTIONS), 1)
             hint = f"; did you mean --{near[0]}?" if near else ""
             raise UserError(f"unknown: --{column}{hint}; see mien batch --help, and mien create --help-all")
         resolved = [str(Path(word).resolve()) if column in _PATHS and _exists(Path(word)) else word for word in found]
@@ -189,17 +171,9 @@ def _column(name: str) -> str:
     return str(name).strip().removeprefix("--").replace("_", "-")
 
 
-def _known() -> list[str]:
-    """Every column that is an option, but for those of methods."""
-    of_groups = {
-        f"{group}.{one.name.replace('_', '-')}" for group, kind in _GROUPS.items() if kind for one in fields(kind)
-    }
-    return sorted({*_OF_CREATE, *_OF_TRAIN, *_OF_IMPORT, *_OF_SCORES} | of_groups)
-
-
 def _is_option(column: str) -> bool:
     group, dot, _ = column.partition(".")
-    return bool(dot) and group in _GROUPS or column in {*_OF_CREATE, *_OF_TRAIN, *_OF_IMPORT, *_OF_SCORES}
+    return bool(dot) and group in _GROUPS or column in _OPTIONS
 
 
 def _check_names(names: Iterable[str], where: str) -> None:
@@ -252,7 +226,7 @@ def _check_twice(words: Sequence[str], where: str, complaint: str) -> None:
 
 def _check_label(column: str, name: str, where: str) -> None:
     """Check that a label is neither a misspelt option nor a column of the results."""
-    near = difflib.get_close_matches(column, [*_known(), *_OWN], 1, 0.8)
+    near = difflib.get_close_matches(column, [*sorted(_OPTIONS), *_OWN], 1, 0.8)
     if near:
         raise UserError(f"{where}: column {name!r} is no option; did you mean {near[0]!r}? Labels need other names")
     if name in RESULT_COLUMNS:
@@ -297,7 +271,7 @@ def _typed(key: str, words: list[str]) -> list[str]:
     is_on = words[0].lower() in ("true", "yes")
     if key.startswith(("training.", "method.")):  # their flags take a value
         return [f"--{key}", str(is_on)]
-    if key in _FLAGS_ON:
+    if _OF_CREATE.get(key) is True:  # on unless it is turned off: --capture.no-cuts
         group, dot, flag = key.rpartition(".")
         return [] if is_on else [f"--{group}{dot}no-{flag}"]
     return [f"--{key}"] if is_on else []

@@ -1,7 +1,6 @@
 """Measure this machine and this version of mien."""
 
 import json
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.commands.train_options import check_method, listed_methods
+from mien.disk.config import POSITIVE, Range
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
@@ -20,26 +20,18 @@ from mien.machine.terminal import show
 from mien.plugins import named
 
 if TYPE_CHECKING:
-    import torch
-
     StepMethod = str
     CaptureName = str
 else:
     StepMethod, CaptureName = Literal[tuple(STEP_BENCHMARKS)], Literal[tuple(PEOPLE["references"])]
-
-_MOST_MINUTES = 100_000
 
 
 @dataclass(frozen=True)
 class _Timed:
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the machine and all rows as json, for programs."""
-    seconds: float = 0.8
+    seconds: Annotated[float, POSITIVE] = 0.8
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
-
-    def _check_seconds(self) -> None:
-        if not 0 < self.seconds < math.inf:
-            raise UserError(f"--seconds {self.seconds:g}: give a positive number; each row is measured for that long")
 
 
 @dataclass(frozen=True)
@@ -50,17 +42,17 @@ class Render(_Timed):
     """Device to draw on. cuda measures gsplat on a GPU, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Check that CUDA has gsplat and that there is time to measure."""
-        self._check_seconds()
+        """Check that CUDA has gsplat."""
         check_device(self.device)
 
     def run(self) -> None:
         """Measure and print the rows."""
         from mien.lab.benchmarking.render import gpu_rows, render_suite
 
-        like = _gpu(self.device)
-        rows = render_suite(self.seconds) if like is None else gpu_rows(like, self.seconds)
-        show_rows(rows, self.as_json, gpu=like is not None)
+        device = choose_device(self.device)
+        on_gpu = device.type == "cuda"
+        rows = gpu_rows(like_on(device), self.seconds) if on_gpu else render_suite(self.seconds)
+        show_rows(rows, self.as_json, gpu=on_gpu)
 
 
 @dataclass(frozen=True)
@@ -71,10 +63,9 @@ class Scaling(_Timed):
     """File for a chart, .svg (default: no chart)."""
 
     def check(self) -> None:
-        """Check before any measurement that the chart can be written and that there is time to measure."""
+        """Check before any measurement that the chart can be written."""
         from mien.disk.files import check_writable
 
-        self._check_seconds()
         if self.plot is not None:
             if self.plot.suffix != ".svg":
                 raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
@@ -100,14 +91,13 @@ class TrainStep(_Timed):
     """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
     A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
     fastest round."""
-    seconds: float = 3.0
+    seconds: Annotated[float, POSITIVE] = 3.0
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
     """Device to train on. cuda measures a GPU, where gsplat draws, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Check that CUDA has gsplat and that there is time to measure."""
-        self._check_seconds()
+        """Check that CUDA has gsplat, and that the options fit together."""
         check_device(self.device)
         if self.method not in GPU_BENCHMARKS and self.device == "cuda":
             raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
@@ -123,11 +113,11 @@ class TrainStep(_Timed):
 
             show_rows(parts_suite(self.seconds), self.as_json, as_text=format_parts)
             return
-        like = _gpu(self.device) if self.method in GPU_BENCHMARKS else None
-        if like is None:
-            show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)
+        device = choose_device(self.device)
+        if device.type == "cuda" and self.method in GPU_BENCHMARKS:
+            show_rows(named(GPU_BENCHMARKS[self.method])(like_on(device), self.seconds), self.as_json, gpu=True)
         else:
-            show_rows(named(GPU_BENCHMARKS[self.method])(like, self.seconds), self.as_json, gpu=True)
+            show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)
 
 
 @dataclass(frozen=True)
@@ -140,7 +130,7 @@ class Quality:
     captures: tuple[CaptureName, ...] = ()
     """Names of reference captures (default: all but ring-16-large, which takes hours)."""
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
-    steps: int = 0
+    steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps. 0 means each capture's own number."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
@@ -148,10 +138,8 @@ class Quality:
     """Print all rows as json, for programs."""
 
     def check(self) -> None:
-        """Check that there is such a method, and that the number of steps is not negative."""
+        """Check that there is such a method."""
         check_method("--method", self.method)
-        if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for each capture's own number")
 
     def run(self) -> None:
         """Run every capture through all stages, then print the table."""
@@ -174,10 +162,10 @@ class Compare:
     captures: tuple[CaptureName, ...] = ()
     """Reference captures as well. They are drawn, captured and tracked in --out first."""
     methods: Annotated[tuple[str, ...], listed_methods("Methods to compare")] = tuple(METHODS)
-    minutes: float = 0.0
+    minutes: Annotated[float, Range(0, 100_000)] = 0.0
     """Minutes of training for each method on each capture. Two short trials on this machine turn them into steps. 0
     means --steps."""
-    steps: int = 0
+    steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
     split: Literal["blocks", "tail"] = "blocks"
     """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
@@ -193,20 +181,15 @@ class Compare:
 
         if not self.workspaces and not self.captures:
             raise UserError("nothing to compare on; give workspace folders, or --captures NAME")
-        if not 0 <= self.minutes <= _MOST_MINUTES:
-            raise UserError(f"--minutes {self.minutes:g}: give a number from 0 to {_MOST_MINUTES}")
-        if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a positive number, or 0 for the preset's number")
         if self.minutes and self.steps:
             raise UserError(f"--minutes {self.minutes:g} --steps {self.steps}: give one of them")
         if not self.methods:
             raise UserError("--methods: give at least one method")
         for method in self.methods:
             check_method("--methods", method)
-        roots = [folder.resolve() for folder in self.workspaces]
-        names = [root.name for root in roots] + list(self.captures)
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
+        names = [folder.resolve().name for folder in self.workspaces] + list(self.captures)
+        if len({*names}) < len(names):
+            twice = max(names, key=names.count)
             raise UserError(f"{twice}: two captures have this name; give one of them, or rename its folder")
         for folder in self.workspaces:
             open_workspace(folder)
@@ -214,26 +197,21 @@ class Compare:
 
     def run(self) -> None:
         """Train and score every method on every capture, then print the table."""
-        from mien.pipeline.comparing import Budget, CompareSettings, run_compare_stage
+        from mien.pipeline.comparing import run_compare_stage
 
-        methods = tuple(dict.fromkeys(self.methods))
-        settings = CompareSettings(methods, Budget(self.minutes, self.steps), self.split)
-        opened = [open_workspace(folder) for folder in self.workspaces]
-        run_compare_stage(self.out, opened, self.captures, settings, as_json=self.as_json)
+        run_compare_stage(
+            self.out, [open_workspace(folder) for folder in self.workspaces], self.captures,
+            list(dict.fromkeys(self.methods)), minutes=self.minutes, steps=self.steps, split=self.split,
+            as_json=self.as_json,
+        )  # fmt: skip
 
 
 TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
-def _gpu(name: DeviceName) -> "torch.Tensor | None":
-    """A scalar on the chosen GPU, or None for the CPU."""
-    device = choose_device(name)
-    return like_on(device) if device.type == "cuda" else None
-
-
 def show_rows(
-    rows: "Iterable[Any]", as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
-) -> "list[Any]":
+    rows: Iterable[Any], as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
+) -> list[Any]:
     """Print the machine, and each row (or list of rows) once it is measured, or everything as json, with one thread."""
     import torch
 

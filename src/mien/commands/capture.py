@@ -9,6 +9,7 @@ import tyro
 from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
+from mien.pipeline.names import check_sources
 
 
 @dataclass(frozen=True)
@@ -41,29 +42,22 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without the libraries that capture."""
-        from mien.pipeline.names import check_videos, rig_name, sequence_names
-
-        names = () if self.name is None else (self.name,)
-        if self.calibration is not None:
-            rig_name(self.videos, self.calibration, names)
-        elif len(self.videos) > 1:
+        if self.calibration is None and len(self.videos) > 1:
             raise UserError(
                 f"{self.videos[1]}: several videos become one capture only if their cameras are calibrated; add "
                 "--calibration FILE, or capture one at a time"
             )
-        else:
-            sequence_names(self.videos, names)
         self.settings.check()
         check_new_workspace(self.out)
-        check_videos(self.videos)
+        check_sources(self.videos, self._names, self.calibration)
 
     def run(self) -> None:
         """Capture the videos and report what was found."""
-        from mien.pipeline.capture import run_calibrated_capture_stage, run_capture_stage
+        from mien.pipeline.capture import run_capture_stage
 
         workspace = Workspace(self.out)
-        if self.calibration is None:
-            run_capture_stage(workspace, self.videos[0], self.name, self.settings, self.replace)
-        else:
-            names = () if self.name is None else (self.name,)
-            run_calibrated_capture_stage(workspace, self.videos, self.calibration, names, self.settings, self.replace)
+        run_capture_stage(workspace, self.videos, self._names, self.calibration, self.settings, self.replace)
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return () if self.name is None else (self.name,)

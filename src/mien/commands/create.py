@@ -7,15 +7,39 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mien.avatar.settings import MethodConfig
 from mien.capture.settings import CaptureSettings
-from mien.commands.train_options import TrainOptions
+from mien.commands.train_options import Elsewhere, TrainOptions
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.pipeline.names import check_viewer
-from mien.tracking.settings import ScoringSettings, TrackingSettings
-from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
+from mien.pipeline.names import check_sources, check_viewer, run_name, sequence_names
+from mien.tracking.settings import (
+    PaperSettings,
+    PhotometricSettings,
+    ScoringSettings,
+    SmoothnessSettings,
+    TrackingSettings,
+)
+from mien.training.settings import PRESETS, AlignmentSettings
 from mien.training.settings.splits import SPLITS
+
+
+@dataclass(frozen=True)
+class _Tracking(TrackingSettings):
+    """Settings of the tracking. `mien track` has more of them."""
+
+    smoothness: Elsewhere = SmoothnessSettings()
+    photometric: Elsewhere = PhotometricSettings()
+    paper: Elsewhere = PaperSettings()
+
+
+@dataclass(frozen=True)
+class _Alignment(AlignmentSettings):
+    """Whether frames are aligned. `mien align` has the settings."""
+
+    template_steps: Elsewhere = AlignmentSettings.template_steps
+    template_gaussians: Elsewhere = AlignmentSettings.template_gaussians
+    resolution: Elsewhere = AlignmentSettings.resolution
+    iterations: Elsewhere = AlignmentSettings.iterations
 
 
 @dataclass(frozen=True)
@@ -48,14 +72,12 @@ class Command:
     """Show the avatar in a browser while it trains."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions.of)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
-    tracking: TrackingSettings = field(default_factory=TrackingSettings)
-    alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
+    tracking: _Tracking = field(default_factory=_Tracking)
+    alignment: _Alignment = field(default_factory=_Alignment)
     scoring: ScoringSettings = field(default_factory=ScoringSettings)
 
     def check(self) -> None:
         """Check options, names and paths without heavy libraries."""
-        from mien.pipeline.names import check_videos, rig_name, run_name, sequence_names
-
         self.options.check()
         if self.view:
             check_viewer()
@@ -66,44 +88,57 @@ class Command:
             )
         if self.track_apart and not self.options.hold_out:
             raise UserError("--track-apart: needs the sequences to track apart; add --hold-out NAME")
-        if self.calibration is None:
-            sequence_names(self.videos, self.name)
-        else:
-            rig_name(self.videos, self.calibration, self.name)
         run_name(self.run_name or self.options.method)
         self.capture.check()
         self.tracking.check()
-        self.alignment.check()
         check_new_workspace(self.out)
-        check_videos(self.videos)
+        check_sources(self.videos, self.name, self.calibration)
 
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
-        from mien.machine.progress import say
-        from mien.pipeline.capture import check_camera_ids
-        from mien.pipeline.create import name_next_commands, show_film
-        from mien.pipeline.face_models import face_model_of
-        from mien.pipeline.names import doubled_videos, run_name, sequence_names
-        from mien.pipeline.track import check_masks
-        from mien.training.run import check_run, check_untouched
-        from mien.training.run import check_videos as check_trained_videos
+        from mien.evaluation.protocols import EvaluationSettings
+        from mien.machine.progress import say, stages
+        from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
+        from mien.pipeline.capture import run_capture_stage
+        from mien.pipeline.create import name_next_commands, show_film, show_page
+        from mien.pipeline.evaluate import run_evaluation_stage
+        from mien.pipeline.track import run_tracking_stage, show_trackings
+        from mien.pipeline.train import run_training_stage
+        from mien.training.settings import check_held_out
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
-        check_run(workspace.run_dir(run), method, settings)
-        if self.calibration is not None:
-            check_camera_ids(self.calibration, settings.held_out_cameras)
-        check_untouched(workspace.run_dir(run))
-        self.options.say_what_is_ignored()
-        face_model_of(self.face_model)
-        check_masks(workspace, workspace.sequence_names(), self.scoring)
-        if self.calibration is None:
-            names = sequence_names(self.videos, self.name)
-            check_trained_videos(workspace.run_dir(run), names, workspace.sequence_names())
-            for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
-                say(f"warning: {warning}")
-        self._run_stages(workspace, run, method, settings)
+        self._check_files(workspace, run)
+        with stages("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out) as begin:
+            begin("capture")
+            captured = run_capture_stage(workspace, self.videos, self.name, self.calibration, self.capture)
+            check_held_out(captured, settings)
+            begin("tracking")
+            apart = settings.held_out_sequences if self.track_apart else ()
+            trackings = run_tracking_stage(
+                workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview, hold_out=apart,
+                scoring=self.scoring, show=False,
+            )  # fmt: skip
+            names = [name for name in captured if name in trackings]
+            begin("alignment")
+            one, least = one_camera(workspace, names), self.alignment.template_steps
+            if one and self.alignment.when == "auto" and settings.steps < least:
+                say(
+                    f"frames are not aligned to a quick avatar, as --steps {settings.steps} is below its own "
+                    f"{least:,}; `--alignment.when always` aligns them"
+                )
+            # A run that goes on keeps its tracking.
+            if self.aligns(not one) and not is_trained_on(workspace, run, names):
+                run_alignment_stage(workspace, names, self.alignment, settings, keep=True)
+            show_trackings(workspace, list(trackings), self.overlay)
+            begin("training")
+            run_training_stage(workspace, names, run, method, settings, self.view)
+            show_page(workspace, run)
+            if settings.holds_out:
+                begin("scoring")
+                # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
+                run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
         show_film(workspace, run)
         say(f"Done in {time.monotonic() - began:.0f} s.")
         name_next_commands(workspace, run)
@@ -114,57 +149,25 @@ class Command:
         auto = auto and self.options.steps >= self.alignment.template_steps  # else the quick avatar is no quicker
         return self.alignment.when == "always" or (self.alignment.when == "auto" and auto)
 
-    def _run_stages(self, workspace: Workspace, run: str, method: MethodConfig, settings: TrainSettings) -> None:
-        from mien.evaluation.protocols import EvaluationSettings
-        from mien.machine.progress import stages
-        from mien.pipeline.create import show_page
-        from mien.pipeline.evaluate import run_evaluation_stage
-        from mien.pipeline.track import run_tracking_stage, show_trackings
-        from mien.pipeline.train import run_training_stage
-        from mien.training.settings import check_held_out
-
-        with stages("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out) as begin:
-            begin("capture")
-            captured = self._capture(workspace)
-            check_held_out(captured, settings)
-            begin("tracking")
-            apart = settings.held_out_sequences if self.track_apart else ()
-            trackings = run_tracking_stage(
-                workspace, self.face_model, self.tracking, overlay=self.overlay, preview=self.preview, hold_out=apart,
-                scoring=self.scoring, show=False,
-            )  # fmt: skip
-            together = [name for name in captured if name in trackings]
-            begin("alignment")
-            self._align(workspace, run, together, settings)
-            show_trackings(workspace, list(trackings), self.overlay)
-            begin("training")
-            run_training_stage(workspace, together, run, method, settings, self.view)
-            show_page(workspace, run)
-            if settings.holds_out:
-                begin("scoring")
-                # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
-                run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
-
-    def _capture(self, workspace: Workspace) -> list[str]:
-        """Capture the videos, and return the names of their sequences."""
-        from mien.pipeline.capture import run_calibrated_capture_stage, run_capture_stage
-        from mien.pipeline.names import sequence_names
-
-        if self.calibration is not None:
-            return run_calibrated_capture_stage(workspace, self.videos, self.calibration, self.name, self.capture)
-        videos = zip(self.videos, sequence_names(self.videos, self.name), strict=True)
-        return [part for video, name in videos for part in run_capture_stage(workspace, video, name, self.capture)]
-
-    def _align(self, workspace: Workspace, run: str, names: list[str], settings: TrainSettings) -> None:
-        """Align new trackings, if the options say so. A run that goes on keeps its tracking."""
+    def _check_files(self, workspace: Workspace, run: str) -> None:
+        """Check what needs heavy libraries: the run, the cameras, the face model, the masks and the videos."""
         from mien.machine.progress import say
-        from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
+        from mien.pipeline.capture import check_camera_ids
+        from mien.pipeline.face_models import face_model_of
+        from mien.pipeline.names import doubled_videos
+        from mien.pipeline.track import check_masks
+        from mien.training.run import check_run, check_untouched, check_videos
 
-        one = one_camera(workspace, names)
-        if one and self.alignment.when == "auto" and settings.steps < self.alignment.template_steps:
-            say(
-                f"frames are not aligned to a quick avatar, as --steps {settings.steps} is below its own "
-                f"{self.alignment.template_steps:,}; `--alignment.when always` aligns them"
-            )
-        if self.aligns(not one) and not is_trained_on(workspace, run, names):
-            run_alignment_stage(workspace, names, self.alignment, settings, keep=True)
+        run_dir, settings = workspace.run_dir(run), self.options.settings()
+        check_run(run_dir, self.options.method_config(), settings)
+        if self.calibration is not None:
+            check_camera_ids(self.calibration, settings.held_out_cameras)
+        check_untouched(run_dir)
+        self.options.say_what_is_ignored()
+        face_model_of(self.face_model)
+        check_masks(workspace, workspace.sequence_names(), self.scoring)
+        if self.calibration is None:
+            names = sequence_names(self.videos, self.name)
+            check_videos(run_dir, names, workspace.sequence_names())
+            for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
+                say(f"warning: {warning}")

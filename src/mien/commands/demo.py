@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from mien.commands.create import Command as Create
 from mien.commands.train_options import PresetName, TrainOptions
-from mien.errors import UserError
-
-_MAX_SECONDS = 600.0
-"""Longest video in seconds. Synthetic heads are drawn frame by frame."""
+from mien.disk.config import Range
 
 
 @dataclass(frozen=True)
@@ -17,11 +17,13 @@ class Command:
 
     out: Path = Path("out/demo")
     """Workspace folder. The video is written there, too."""
+    run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
+    """Name of the run (default: the method's name)."""
     preset: PresetName = "draft"
     """How thorough the training is, as for `mien create`: draft, standard, fine, paper or paper-cpu."""
-    steps: int = 0
+    steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps. 0 means the preset's number."""
-    seconds: float = 0.0
+    seconds: Annotated[float, Range(0, 600)] = 0.0  # synthetic heads are drawn frame by frame
     """Length of the video in seconds. 0 means the default length."""
 
     def check(self) -> None:
@@ -29,8 +31,6 @@ class Command:
         from mien.disk.files import check_writable
 
         self._options().settings()
-        if self.seconds and not 0 < self.seconds <= _MAX_SECONDS:
-            raise UserError(f"--seconds {self.seconds:g}: give a number above 0, at most {_MAX_SECONDS:g}")
         check_writable(self.out, folder=True)
 
     def run(self) -> None:
@@ -46,7 +46,7 @@ class Command:
         if not video.is_file():
             with hold(video):
                 write_synthetic_video(recipe, video, seed=0)
-        create = Create(videos=(video,), out=self.out, name=("synthetic",), options=self._options())
+        create = Create((video,), self.out, ("synthetic",), run_name=self.run_name, options=self._options())
         create.check()
         create.run()
 

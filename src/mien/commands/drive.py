@@ -12,8 +12,7 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
-from mien.pipeline.driver import name_driver, name_neutral
-from mien.pipeline.names import check_avatar, check_port, check_viewer, has_viewer
+from mien.pipeline.names import PORT, check_avatar, check_driver, check_neutral, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
 
 
@@ -75,17 +74,20 @@ class Film(_Neutral, _Film, _Drive):
         open_workspace(self.workspace).pick_run(self.run_name)
         # The number of frames is known only after tracking, but a video or numbered pictures take any number.
         self.picture.plan(self.out, 2)
-        name_driver(Path(self.by), self.sequence, self.fps, self.capture)
-        name_neutral(self.neutral)
+        check_driver(Path(self.by), self.sequence, self.fps, self.capture)
+        check_neutral(self.neutral)
 
     def run(self) -> None:
         """Track the driver if necessary, then pose and render every timestep."""
-        from mien.pipeline.drive import DriveOptions, run_driving_stage
+        from mien.driving.follower import FollowOptions
+        from mien.pipeline.drive import run_driving_stage
 
         workspace = open_workspace(self.workspace)
-        run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        how = self.head_pose, self.alone, self.fps, self.unlimited, self.neutral, self.capture
-        run_driving_stage(run_dir, Path(self.by), self.out, DriveOptions(self.sequence, *how), self.picture)
+        run_driving_stage(
+            workspace.run_dir(workspace.pick_run(self.run_name)), Path(self.by), self.out, self.picture,
+            FollowOptions(self.head_pose, self.unlimited), sequence=self.sequence, fps=self.fps, neutral=self.neutral,
+            capture=self.capture, alone=self.alone,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,23 +95,24 @@ class Show(_Neutral, _Drive):
     """Play the motion of somebody else in a viewer in the browser. --out FILE.mp4 writes a film, with more options."""
 
     remedy: ClassVar[str] = "options of films need --out FILE.mp4; "
-    port: int = 0
-    """Port of the viewer, from 1 to 65535. 0 means a free one."""
+    port: Annotated[int, PORT] = 0
+    """Port of the viewer. 0 means a free one."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         open_workspace(self.workspace).pick_run(self.run_name)
-        check_port(self.port)
         check_viewer()
-        name_driver(Path(self.by), None, None, self.capture)
-        name_neutral(self.neutral)
+        check_driver(Path(self.by), None, None, self.capture)
+        check_neutral(self.neutral)
 
     def run(self) -> None:
         """Show the avatar until Ctrl-C."""
-        from mien.pipeline.view import Motions, Place, run_viewing_stage
+        from mien.pipeline.view import run_viewing_stage
 
-        motions = Motions(self.by, self.neutral, at_once=True, capture=self.capture)
-        run_viewing_stage(self.workspace, self.run_name, motions, Place("127.0.0.1", self.port))
+        run_viewing_stage(
+            self.workspace, self.run_name, play=self.by, neutral=self.neutral, capture=self.capture, at_once=True,
+            port=self.port,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,14 +125,13 @@ class Follow(_Film, _Drive):
     camera_format: CameraFormat | None = None
     """The interface that reads the camera: v4l2 (Linux), avfoundation (macOS) or dshow (Windows). The default is the
     platform's."""
-    port: int = 0
-    """Port of the viewer, from 1 to 65535. 0 means a free one."""
+    port: Annotated[int, PORT] = 0
+    """Port of the viewer. 0 means a free one."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         check_avatar(self.workspace, self.run_name)
         camera_named(self.by, self.camera_format)
-        check_port(self.port)
         if self.out is None:
             check_viewer()
         elif self.picture.plan(self.out, 2).kind != "mp4":
@@ -138,13 +140,11 @@ class Follow(_Film, _Drive):
     def run(self) -> None:
         """Follow until Ctrl-C, or until the file of a camera ends."""
         from mien.driving.follower import FollowOptions
-        from mien.pipeline.follow import CameraOptions, run_following_stage
-        from mien.pipeline.view import Place
+        from mien.pipeline.follow import run_following_stage
 
-        place = Place("127.0.0.1", self.port) if has_viewer() else None
-        follow = FollowOptions(self.head_pose, self.unlimited)
-        options = CameraOptions(follow, self.picture, self.out, self.alone, place)
-        run_following_stage(self.workspace, self.run_name, camera_named(self.by, self.camera_format), options)
+        camera, follow = camera_named(self.by, self.camera_format), FollowOptions(self.head_pose, self.unlimited)
+        port = self.port if has_viewer() else None
+        run_following_stage(self.workspace, self.run_name, camera, follow, self.picture, self.out, self.alone, port)
 
 
 def task_of(arguments: Sequence[str]) -> type:

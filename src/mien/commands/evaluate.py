@@ -8,12 +8,14 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mien.disk.config import Range
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.machine.terminal import show
 
 Protocol = Literal["insta", "imavatar", "nersemble", "nersemble-benchmark", "vhap", "nerface", "nerf-blendshape"]
 """Names of `mien.evaluation.dataset_protocols`, without its imports."""
+_COUNT = Range(0, 1_000_000)
 _FRAMES = 24
 """Number of frames on which ST-LPIPS is computed by default."""
 
@@ -38,7 +40,7 @@ class Run:
     """Also write every scored picture and its truth as png, so that other programs can be scored on them."""
     perceptual: bool = True
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
-    perceptual_frames: int | None = None
+    perceptual_frames: Annotated[int | None, _COUNT] = None
     """Largest number of frames, evenly spread, on which ST-LPIPS and LPIPS are computed. 0 means all frames (default:
     24; with --protocol and --lpips-weights all, as papers do)."""
     lpips_weights: Path | None = None
@@ -54,16 +56,14 @@ class Run:
     fit_faces: bool = False
     """Also score the avatar with expression and pose fitted to each held-out frame by its colours: a third figure
     beside those as tracked and corrected, never the headline. It takes longer."""
-    fit_steps: int = 20
-    """Number of optimiser steps of --fit-faces, for each held-out timestep: 1 to 10,000."""
+    fit_steps: Annotated[int, Range(1, 10_000)] = 20
+    """Number of optimiser steps of --fit-faces, for each held-out timestep."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the result as json on standard output, for programs."""
 
     def check(self) -> None:
         """Check without heavy libraries that there is such a run."""
-        _check_perceptual(self.perceptual_frames, self.lpips_weights)
-        if not 1 <= self.fit_steps <= 10_000:
-            raise UserError(f"--fit-steps {self.fit_steps}: give a number from 1 to 10000")
+        _check_weights(self.lpips_weights)
         open_workspace(self.workspace).pick_run(self.run_name)
 
     def run(self) -> None:
@@ -138,7 +138,7 @@ class Images:
     """Background of the pictures outside the person."""
     perceptual: bool = True
     """By default, ST-LPIPS is computed, which takes most of the time. --no-perceptual leaves it out."""
-    perceptual_frames: int = _FRAMES
+    perceptual_frames: Annotated[int, _COUNT] = _FRAMES
     """Largest number of frames, evenly spread, on which ST-LPIPS and LPIPS are computed. 0 means all frames."""
     lpips_weights: Path | None = None
     """Torchvision's weights, to compute exact LPIPS as well, as for `mien evaluate DIR`."""
@@ -149,7 +149,7 @@ class Images:
 
     def check(self) -> None:
         """Check without heavy libraries that there are pictures."""
-        _check_perceptual(self.perceptual_frames, self.lpips_weights)
+        _check_weights(self.lpips_weights)
         for path in (self.images, self.truth):
             if not path.exists():
                 raise UserError(f"{path}: no such folder; give a folder of pictures, or a video")
@@ -171,8 +171,6 @@ class Images:
 TASKS = {"": Run, "compare": Compare, "images": Images}
 
 
-def _check_perceptual(frames: int | None, weights: Path | None) -> None:
-    if frames is not None and frames < 0:
-        raise UserError(f"--perceptual-frames {frames}: give a positive number, or 0 for all")
+def _check_weights(weights: Path | None) -> None:
     if weights is not None and not weights.is_file():
         raise UserError(f"--lpips-weights {weights}: no such file; give torchvision's file of AlexNet")

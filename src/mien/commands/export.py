@@ -12,7 +12,7 @@ from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, MotionOptions, NoOptions, PoseOptions
 from mien.formats.registry import find_format, format_of, formats, numbered
-from mien.pipeline.driver import name_driver, name_neutral
+from mien.pipeline.names import check_driver, check_neutral
 
 
 def any_of(words: Iterable[str]) -> str:
@@ -21,12 +21,15 @@ def any_of(words: Iterable[str]) -> str:
     return f"{', '.join(others)} or {last}" if others else last
 
 
+def _endings(kinds: Iterable[Format]) -> str:
+    return any_of(ending for each in kinds for ending in each.endings)
+
+
 def _about_out() -> str:
-    numbered_ones = any_of(ending for each in formats() if each.holds == "pose" for ending in each.endings)
     return (
-        f"The file to write: {any_of(ending for each in formats() for ending in each.endings)}. With --series, "
-        f"{numbered_ones} files get numbers: NAME_000000.ply. Each ending has options of its own: `mien export --out "
-        "me.html --help` shows those of .html."
+        f"The file to write: {_endings(formats())}. With --series, "
+        f"{_endings(each for each in formats() if each.holds == 'pose')} files get numbers: NAME_000000.ply. Each "
+        "ending has options of its own: `mien export --out me.html --help` shows those of .html."
     )
 
 
@@ -111,15 +114,15 @@ def task_of(arguments: Sequence[str]) -> type[Command]:
 
 def _refuse_options_of_others(arguments: Sequence[str], kind: Format, out: str) -> None:
     """Name the formats that have an option which `kind` lacks."""
+
+    def options(of: Format) -> set[str]:
+        return {f"--{each.name.replace('_', '-')}" for each in fields(of.options())}
+
     typed = {each.partition("=")[0].replace("_", "-") for each in arguments if each.startswith("--")}
-    for option in sorted(typed - {"--out", "--format", "--run", "--help", "--help-all"} - _options(kind)):
-        others = [each.name for each in formats() if option in _options(each)]
+    for option in sorted(typed - {"--out", "--format", "--run", "--help", "--help-all"} - options(kind)):
+        others = [each.name for each in formats() if option in options(each)]
         if others:
             raise UserError(f"{out}: {option} is an option of {any_of(others)}, not of {kind.name}; leave it out")
-
-
-def _options(kind: Format) -> set[str]:
-    return {f"--{each.name.replace('_', '-')}" for each in fields(kind.options())}
 
 
 def _kind(out: Path, name: str | None) -> Format:
@@ -127,8 +130,7 @@ def _kind(out: Path, name: str | None) -> Format:
     if name is None:
         kind = format_of(out)
         if kind is None:
-            use = any_of(ending for each in formats() for ending in each.endings)
-            ending = out.suffix.lower() or "a file without ending"
+            ending, use = out.suffix.lower() or "a file without ending", _endings(formats())
             raise UserError(f"{out}: cannot write {ending}; use {use}, or --format gaussian-avatars for a folder")
         return kind
     kind = find_format(name)
@@ -146,7 +148,7 @@ def _kind(out: Path, name: str | None) -> Format:
 
 
 def _check_motion(workspace: Workspace, options: MotionOptions) -> None:
-    name_neutral(options.neutral)
+    check_neutral(options.neutral)
     names = workspace.sequence_names()
     if options.series is None or options.series in names:
         return
@@ -155,4 +157,4 @@ def _check_motion(workspace: Workspace, options: MotionOptions) -> None:
             f"--series {options.series}: no such sequence, file or folder; {workspace.root} has the sequences "
             f"{', '.join(names) or '(none)'}; or give a workspace, a video, a recording or a sound file"
         )
-    name_driver(Path(options.series), None)
+    check_driver(Path(options.series), None)

@@ -66,16 +66,19 @@ class Command:
         try:
             self._read(dataset, told)
         except UserError as error:
-            other = self._looks_like() if type(error) is UserError else None
-            if other is None:
+            if type(error) is not UserError or self.dataset is None or dataset.recognises(self.path) is not None:
                 raise
+            try:
+                other = recognised(self.path)[0].name
+            except UserError:
+                raise error from None
             raise UserError(
                 f"{self.path}: looks like {other}, and cannot be read as {dataset.name}; leave --dataset out ({error})"
             ) from None
 
     def _read(self, dataset: Dataset, told: str | None) -> None:
         from mien.machine.progress import say
-        from mien.pipeline.import_dataset import findings_lines
+        from mien.pipeline.import_dataset import findings_lines, run_import_stage
 
         if told is not None and (self.dry_run or dataset.holds == "sequences"):
             say(f"{self.path}: {told}")  # before they are read, which takes long
@@ -88,12 +91,10 @@ class Command:
                 say(f"{self.out}: all sequences are there already")
                 return
         if not self.dry_run:
-            from mien.pipeline.import_dataset import run_import_stage
-
-            workspace, run = Workspace(self.out), self._run(dataset)
             run_import_stage(
-                dataset, self.path, workspace, run, self.face_model, self.retrack, self.resume, self.color_correction
-            )
+                dataset, self.path, Workspace(self.out), self._run(dataset), self.face_model, self.retrack, self.resume,
+                self.color_correction,
+            )  # fmt: skip
 
     def _is_there(self, findings: Findings) -> bool:
         """Whether there is nothing to do. Without --resume, no sequence may be there, which is checked first."""
@@ -106,15 +107,6 @@ class Command:
     def _found(self) -> tuple[Dataset, str | None]:
         """The dataset, and what it found; None if the user names the dataset."""
         return recognised(self.path) if self.dataset is None else (find_dataset(self.dataset), None)
-
-    def _looks_like(self) -> str | None:
-        """Return the name of the dataset that the files are, if the user named another one."""
-        if self.dataset is None or find_dataset(self.dataset).recognises(self.path) is not None:
-            return None
-        try:
-            return recognised(self.path)[0].name
-        except UserError:
-            return None
 
     def _run(self, dataset: Dataset) -> str:
         return dataset.name.replace("-", "_") if self.name is None else self.name

@@ -5,7 +5,7 @@ import contextlib
 import inspect
 import io
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
 from types import FunctionType, ModuleType
@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import tyro
 
 from mien.commands.train_options import TrainOptions
-from mien.disk.config import Range, range_of, shown
+from mien.disk.config import Range, check_range, shown
 from mien.errors import UserError
 from mien.machine.terminal import show
 
@@ -56,26 +56,28 @@ def parse(module: ModuleType, name: str, arguments: Sequence[str]) -> Any:
     return parse_options(tasks[task], prog, rest)
 
 
-def parse_options(command: type, prog: str, arguments: Sequence[str]) -> Any:
+def parse_options(kind: type, prog: str, arguments: Sequence[str]) -> Any:
     """The options of a command. Their defaults are those of the preset and the file that the arguments name."""
-    default, names = with_defaults(command, arguments), [argument.partition("=")[0] for argument in arguments]
+    default, names = with_defaults(kind, arguments), [argument.partition("=")[0] for argument in arguments]
     parts = [default, *(part for part in vars(default).values() if is_dataclass(part))]
     for name in (name for part in parts for name, value in vars(part).items() if isinstance(value, tuple)):
         if names.count(option := f"--{name.replace('_', '-')}") > 1:
             # The first of its values would be dropped without a word.
             raise UserError(f"{option} is given twice; give it once, followed by all of its values")
     if {"-h", "--help", "--help-all"} & {*arguments}:
-        _help(command, prog, arguments)
-    told, more = io.StringIO(), getattr(command, "takes_more", False)
+        _help(kind, prog, arguments)
+    told, more = io.StringIO(), getattr(kind, "takes_more", False)
     try:
         with contextlib.redirect_stderr(told):
-            found = tyro.cli(
-                command, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more
-            )
+            found = tyro.cli(kind, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more)
     except SystemExit:
-        remedy = getattr(command, "remedy", "")
+        remedy = getattr(kind, "remedy", "")
         raise UserError(f"{in_one_line(told.getvalue())}; {remedy}see {prog} --help-all") from None
-    return replace(found[0], for_all=tuple(found[1])) if more else found
+    command = replace(found[0], for_all=tuple(found[1])) if more else found
+    for name, option, _, marks in _named_fields(type(command), ""):  # groups of settings check themselves
+        for allowed in (mark for mark in marks if isinstance(mark, Range)):
+            check_range(getattr(command, name), allowed, f"--{option}")
+    return command
 
 
 def with_defaults(command: type, arguments: Sequence[str]) -> Any:
@@ -131,37 +133,54 @@ def explained(
 ) -> type:
     """A class of options whose descriptions are paragraphs, and end with the range, the default and those of presets.
 
-    Args:
-        options: The options with the defaults to show.
-        is_shown: Whether to show an option, by its name such as "capture.size".
-        prefix: Beginning of the names of options.
-        presets: The same options by each preset.
+    `is_shown` says whether to show an option, by its name such as "capture.size", which begins with `prefix`. `presets`
+    has the same options by each preset.
     """
     kind = type(options)
-    hints, about, annotations, defaults = get_type_hints(kind, include_extras=True), field_docs(kind), {}, {}
-    for one in fields(kind):
-        value, hint = getattr(options, one.name), hints[one.name]
-        base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        name = next((mark.name for mark in marks if getattr(mark, "name", None) is not None), None)
-        option = ".".join(filter(None, (prefix, one.name.replace("_", "-") if name is None else name)))
-        others = {preset: getattr(each, one.name) for preset, each in (presets or {}).items()}
+    about, annotations, defaults = field_docs(kind), {}, {}
+    for name, option, base, marks in _named_fields(kind, prefix):
+        value, others = getattr(options, name), {each: getattr(one, name) for each, one in (presets or {}).items()}
+        if tyro.conf.Fixed in marks:
+            annotations[name], defaults[name] = Annotated[(base, *marks)], value
+            continue
         if is_dataclass(value):
             others = value.by_preset() if isinstance(value, TrainOptions) else others
             group = explained(value, is_shown, option, others)
-            annotations[one.name] = Annotated[(group, *marks)] if marks else group
-            defaults[one.name] = field(default_factory=group)
+            annotations[name] = Annotated[(group, *marks)] if marks else group
+            defaults[name] = field(default_factory=group)
             continue
         marks += [] if tyro.conf.Positional in marks or is_shown(option) else [tyro.conf.Suppress]
         listed = [mark() for mark in marks if isinstance(mark, FunctionType)]  # what is registered
-        text = " ".join(" ".join([about.get(one.name, ""), *listed]).split())
+        text = " ".join(" ".join([about.get(name, ""), *listed]).split())
         is_flag = base is bool and not prefix.startswith(("training", "method"))
-        values = partial(_about_value, is_flag or "(default:" in text, range_of(hint), value, others)
-        annotations[one.name] = Annotated[(base, *marks, tyro.conf.arg(help=text, help_behavior_hint=values))]
+        allowed = next((mark for mark in marks if isinstance(mark, Range)), None)
+        values = partial(_about_value, is_flag or "(default:" in text, allowed, value, others)
+        annotations[name] = Annotated[(base, *marks, tyro.conf.arg(help=text, help_behavior_hint=values))]
         if value is not tyro.MISSING:
-            defaults[one.name] = value
+            defaults[name] = value
     # It is a subclass, because tyro finds descriptions of groups in the parent.
     inside = {"__annotations__": annotations, "__doc__": kind.__doc__, "__module__": kind.__module__, **defaults}
     return dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), inside))
+
+
+def options_of(options: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The options of a command by their names, such as "capture.size", with their defaults."""
+    for name, option, _, marks in _named_fields(type(options), prefix):
+        value = getattr(options, name)
+        if is_dataclass(value) and tyro.conf.Fixed not in marks:
+            yield from options_of(value, option)
+        elif not {tyro.conf.Fixed, tyro.conf.Positional} & {*marks}:
+            yield option, value
+
+
+def _named_fields(kind: type, prefix: str) -> Iterator[tuple[str, str, Any, list[Any]]]:
+    """The fields of a class of options: name, name of the option, type, and marks beside the type."""
+    hints = get_type_hints(kind, include_extras=True)
+    for one in fields(kind):
+        base, *marks = get_args(hint) if get_origin(hint := hints[one.name]) is Annotated else (hint,)
+        name = next((mark.name for mark in marks if getattr(mark, "name", None) is not None), None)
+        option = ".".join(filter(None, (prefix, one.name.replace("_", "-") if name is None else name)))
+        yield one.name, option, base, marks
 
 
 def _about_value(is_silent: bool, allowed: Range | None, value: Any, others: Mapping[str, Any], default: str) -> str:

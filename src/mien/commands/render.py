@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from mien.disk.config import Range
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     import mien.face
 
 _PATHS = ("turntable", "orbit", "sway", "still", "captured")
-_TILT = math.radians(15)
-"""Angle that orbit and sway go up and down."""
-_MAX_STRENGTH = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,81 +30,33 @@ class _Look:
     """Options that `render` and `render sheet` share: the avatar, its face, and the view."""
 
     workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Workspace folder. Without sheets also a .mien file, which is drawn without torch."""
+    """Workspace folder."""
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     set: tuple[str, ...] = ()
     """Expressions and whole faces by name, and joint angles in radians, for example --set smile=0.6 jawOpen=0.3
     eyeLookUpLeft=0.5 left_eye_y=0.2 (default: the person's neutral). An unknown name lists all of them."""
     timestep: int | None = None
-    """Show the face at this timestep (from 0) of --motion, or of what the run was trained on."""
-    span: float = 40.0
-    """Angle from end to end of a turntable, or that the camera swings through, in degrees. 360 goes all the way round.
-    40 is about what one camera films; sides that were not filmed are made up, or look broken if they were trained."""
-    yaw: float = 0.0
+    """Show the face at this timestep (from 0) of what the run was trained on."""
+    span: Annotated[float, Range(-3600, 3600)] = 40.0
+    """Angle from end to end, in degrees. 360 goes all the way round. 40 is about what one camera films; sides that were
+    not filmed are completed, or look broken if they were trained."""
+    yaw: Annotated[float, Range(-180, 180)] = 0.0
     """Angle by which the camera moves around the head before anything else, in degrees: to the person's left, or to the
     right if negative."""
-    pitch: float = 0.0
+    pitch: Annotated[float, Range(-89, 89)] = 0.0
     """The same upwards, or downwards if negative."""
-    zoom: float | None = None
-    """Magnification. 1 shows what the camera saw in training (default: 1, or less if that cuts off the head; on a sheet
-    as much as the head fits)."""
+    zoom: Annotated[float | None, Range(0.01, 100)] = None
+    """Magnification. 1 shows what the camera saw in training (default: as much as the head fits)."""
     device: DeviceName = "cpu"
     """Device that poses and draws: cpu, cuda (an NVIDIA GPU, through gsplat), or auto (a GPU if there is one)."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
-
-    def _check_look(self) -> None:
-        """Check numbers and the device without heavy libraries."""
-        check_device(self.device)
-        self.picture.color()
-        if not 0.01 <= self.magnification <= 100:
-            raise UserError(f"--zoom {self.magnification:g}: give a number from 0.01 to 100")
-        if not math.isfinite(self.span):
-            raise UserError(f"--span {self.span:g}: give a number of degrees")
-        for name, angle, limit in (("yaw", self.yaw, 180), ("pitch", self.pitch, 89)):
-            if not abs(angle) <= limit:
-                raise UserError(f"--{name} {angle:g}: give degrees between -{limit} and {limit}")
-
-    @property
-    def magnification(self) -> float:
-        """The magnification, 1 by default."""
-        return 1.0 if self.zoom is None else self.zoom
-
-    def camera(self, run_dir: Path, subject: "mien.face.FaceParams", options: PictureOptions) -> "mien.camera.Camera":
-        """The run's first camera, moved by --yaw, --pitch and --zoom."""
-        from mien.pipeline.draw import view
-        from mien.training.run import run_camera
-
-        return self.turned(view(options, run_camera(run_dir), self.magnification), subject)
 
     def turned(self, camera: "mien.camera.Camera", subject: "mien.face.FaceParams") -> "mien.camera.Camera":
         """A camera moved by --yaw and --pitch."""
         from mien.render.camera_paths import turned_camera
 
         return turned_camera(camera, subject.head_translation[0], math.radians(self.yaw), math.radians(self.pitch))
-
-    def face(
-        self, run_dir: Path, avatar: "mien.avatar.Avatar", motion: "mien.face.FaceParams | None"
-    ) -> "mien.face.FaceParams":
-        """The face of a motion, at --timestep or at rest, changed by --set. What was never filmed is told."""
-        from mien.face.checks import check_face_params
-        from mien.pipeline.expression import tell_of_unfilmed, with_expression
-        from mien.training.run import filmed_range, read_face_track
-
-        model, subject = avatar.face_model, avatar.subject
-        if self.timestep is not None:
-            motion = read_face_track(run_dir, model) if motion is None else motion
-            if not 0 <= self.timestep < len(motion):
-                last = len(motion) - 1
-                raise UserError(f"--timestep {self.timestep}: {run_dir} has the timesteps 0 to {last}; give one")
-            motion = motion[self.timestep]
-        face = subject if motion is None else motion
-        face = replace(face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
-        check_face_params(model, face, "--motion", "choose a sequence that was tracked with the avatar's face model")
-        face = with_expression(face, model, self.set)
-        if self.set:
-            tell_of_unfilmed(self.set, face, model, filmed_range(run_dir, avatar))
-        return face
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,15 +66,21 @@ class Render(_Look):
     mien render sheet DIR KIND: many pictures in one, each with its name.
     """
 
+    workspace: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Workspace folder, or a .mien file, which is drawn without torch."""
+    timestep: int | None = None
+    """Show the face at this timestep (from 0) of --motion, or of what the run was trained on."""
+    zoom: Annotated[float | None, Range(0.01, 100)] = None
+    """Magnification. 1 shows what the camera saw in training (default: 1, or less if that cuts off the head)."""
     out: Path
     """Output: .png for a still, a folder or NAME_%06d.png for numbered pictures, .mp4 or .webm for a video."""
     path: str = "turntable"
     """Path of the camera: to both sides (turntable), an oval (orbit), a figure eight (sway), no motion (still), from
     camera to camera of the capture (captured), or a json file of cameras, one per frame (docs/using.md), which keep
     their own sizes. A .png is always a still."""
-    frames: int = 120
+    frames: Annotated[int, Range(1, 1_000_000)] = 120
     """Number of frames of the video."""
-    fps: float = 25.0
+    fps: Annotated[float, Range(1e-9, 1000, words="a number above 0, at most 1000")] = 25.0
     """Frames per second of the video."""
     motion: str | None = None
     """A sequence whose motion the avatar plays, one frame per timestep, or own: the motion that the run was trained on
@@ -132,11 +88,8 @@ class Render(_Look):
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        self._check_look()
-        if self.frames < 1:
-            raise UserError(f"--frames {self.frames}: give 1 or more")
-        if not 0 < self.fps <= 1000:
-            raise UserError(f"--fps {self.fps:g}: give a number above 0, at most 1000")
+        check_device(self.device)
+        self.picture.color()
         if self.path not in _PATHS and not self._is_listed():
             raise UserError(f"--path {self.path}: give one of {', '.join(_PATHS)}, or a .json of cameras")
         check_avatar(self.workspace, self.run_name)
@@ -161,12 +114,18 @@ class Render(_Look):
         from mien.machine.progress import say, track_progress
         from mien.media.writing import write_pictures
         from mien.pipeline.draw import draw, posed_softly, sides_filmed, warn_of_white
+        from mien.pipeline.expression import chosen_face
+        from mien.training.footage.sequence import read_sequence
+        from mien.training.run import read_face_track
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
-        avatar = load_avatar(run_dir)
-        motion = self._motion(workspace, run_dir, avatar.face_model)
-        face = self.face(run_dir, avatar, motion)
+        avatar, motion = load_avatar(run_dir), None
+        if self.motion == "own":
+            motion = read_face_track(run_dir, avatar.face_model)
+        elif self.motion is not None:
+            motion = read_sequence(workspace.sequence_dir(self.motion)).tracking.face
+        face = chosen_face(run_dir, avatar, motion, self.timestep, self.set)
         moves = motion is not None and self.timestep is None
         cameras = self._cameras(workspace, run_dir, avatar, face, len(face) if moves else None)
         output = self.picture.plan(self.out, len(cameras))
@@ -192,16 +151,6 @@ class Render(_Look):
     def _sequence(self) -> str | None:
         return None if self.motion == "own" else self.motion
 
-    def _motion(
-        self, workspace: Workspace, run_dir: Path, model: "mien.face.FaceModel"
-    ) -> "mien.face.FaceParams | None":
-        from mien.training.footage.sequence import read_sequence
-        from mien.training.run import read_face_track
-
-        if self.motion == "own":
-            return read_face_track(run_dir, model)
-        return None if self.motion is None else read_sequence(workspace.sequence_dir(self.motion)).tracking.face
-
     def _cameras(
         self,
         workspace: Workspace,
@@ -211,9 +160,10 @@ class Render(_Look):
         timesteps: int | None,
     ) -> "list[mien.camera.Camera]":
         """The camera of each frame."""
-        from mien.pipeline.draw import posed_softly, view, whole
+        from mien.pipeline.draw import posed_softly, whole
         from mien.render import camera_paths
         from mien.tracking.files import read_tracking
+        from mien.training.run import run_camera
 
         if self._is_listed():
             cameras = camera_paths.read_cameras(Path(self.path))
@@ -225,27 +175,28 @@ class Render(_Look):
         elif self.path == "captured":
             name = workspace.pick_sequence(self._sequence)
             stored = read_tracking(workspace.sequence_dir(name) / "tracking").cameras
-            cameras = [view(self.picture, camera, self.magnification) for camera in stored]
+            cameras = [camera.fitted(*self.picture.shape(), self.zoom or 1.0) for camera in stored]
             if self._is_still():
                 cameras = cameras[:1]
             elif timesteps is not None:
                 cameras = [cameras[index * len(cameras) // timesteps] for index in range(timesteps)]
         else:
-            first = self.camera(run_dir, avatar.subject, self.picture)
+            first = run_camera(run_dir).fitted(*self.picture.shape(), self.zoom or 1.0)
+            first = self.turned(first, avatar.subject)
             first = whole(first, posed_softly(avatar)(face[0])) if self.zoom is None else first
             return self._moved(camera_paths, first, avatar.subject.head_translation[0], self._frames(timesteps))
         return [self.turned(camera, avatar.subject) for camera in cameras] if self.yaw or self.pitch else cameras
 
     def _draw_file(self) -> None:
         """Draw the avatar of a file, without torch."""
-        from mien.pipeline.draw_file import View, render_file
+        from mien.pipeline.draw_file import render_file
         from mien.runtime import camera_paths
 
         frames = self._frames(None)
-        view = View(
-            self.yaw, self.pitch, self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames)
-        )
-        render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
+        render_file(
+            self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, self.yaw, self.pitch,
+            self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames), self.fps,
+        )  # fmt: skip
 
     def _moved(self, paths: Any, camera: Any, center: "numpy.ndarray | torch.Tensor", frames: int) -> list[Any]:
         """The cameras of --path, by the module that moves cameras of this type."""
@@ -254,7 +205,8 @@ class Render(_Look):
             return [camera] * frames
         if self.path == "turntable":
             return paths.turntable(camera, center, frames, span)
-        return paths.sway(camera, center, frames, span, _TILT, crossing=self.path == "sway")
+        tilt = math.radians(15)  # up and down
+        return paths.sway(camera, center, frames, span, tilt, crossing=self.path == "sway")
 
     def _is_listed(self) -> bool:
         """Whether the cameras come from a file."""
@@ -280,17 +232,15 @@ class Sheet(_Look):
     """What the pictures show."""
     out: Path | None = None
     """The .png (default: sheet_KIND.png in the run's folder)."""
-    strength: float = 1.0
-    """Strength of the expressions, from 0 to 3."""
+    strength: Annotated[float, Range(0, 3)] = 1.0
+    """Strength of the expressions."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        self._check_look()
+        check_device(self.device)
         open_workspace(self.workspace).pick_run(self.run_name)
         if self._output.suffix.lower() != ".png" or "%" in self._output.name:
             raise UserError(f"{self._output}: a sheet is one picture; give --out NAME.png")
-        if not 0 <= self.strength <= _MAX_STRENGTH:
-            raise UserError(f"--strength {self.strength:g}: give a number from 0 to {_MAX_STRENGTH:g}")
         if self.picture.background == "transparent":
             raise UserError("--background transparent: a sheet has no transparency; choose a colour")
         self.picture.plan(self._output, 1)
@@ -303,15 +253,17 @@ class Sheet(_Look):
         from mien.media.writing import write_pictures
         from mien.pipeline import sheets
         from mien.pipeline.draw import draw, posed_softly, sides_filmed
-        from mien.training.run import filmed_range
+        from mien.pipeline.expression import chosen_face
+        from mien.training.run import filmed_range, run_camera
 
         workspace = open_workspace(self.workspace)
         run_dir = workspace.run_dir(workspace.pick_run(self.run_name))
         avatar, options = load_avatar(run_dir), self.picture
-        face, model = self.face(run_dir, avatar, None), avatar.face_model
+        face, model = chosen_face(run_dir, avatar, None, self.timestep, self.set), avatar.face_model
         if self.kind != "turntable" and options.size is None:
             options = replace(options, size=sheets.SMALL_TILE)
-        camera = self.camera(run_dir, avatar.subject, options)
+        camera = run_camera(run_dir).fitted(*options.shape(), self.zoom or 1.0)
+        camera = self.turned(camera, avatar.subject)
         if self.kind == "turntable":
             tiles = sheets.turntable_tiles(face, camera, avatar.subject.head_translation[0], self.span)
         elif self.kind == "filmed":

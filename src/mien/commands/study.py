@@ -13,7 +13,6 @@ from mien.machine.terminal import show
 
 if TYPE_CHECKING:
     from mien.lab.analysis.study.files import StudySettings
-    from mien.lab.analysis.study.making import StudyRuns
 
 
 @dataclass(frozen=True)
@@ -52,22 +51,27 @@ class Make:
         if self.out.suffix.lower() != ".html":
             raise UserError(f"--out {self.out}: give a file that ends in .html")
         check_writable(self.out)
-        roots = [folder.resolve() for folder in self.workspaces]
-        twice = next((root for root in roots if roots.count(root) > 1), None)
-        if twice is not None:
-            raise UserError(f"{twice}: is given twice; give each workspace once")
-        for workspace in (opened := [open_workspace(folder) for folder in self.workspaces]):
+        opened = [open_workspace(folder) for folder in self.workspaces]
+        roots = [workspace.root.resolve() for workspace in opened]
+        if len({*roots}) < len(roots):
+            raise UserError(f"{max(roots, key=roots.count)}: is given twice; give each workspace once")
+        for workspace in opened:
             check_subtrees(workspace.root, "runs", "sequences")
         self._labels(opened)
 
     def run(self) -> None:
         """Write the page and the key."""
-        from mien.lab.analysis.study.making import write_study
+        from mien.lab.analysis.study.making import StudyRuns, write_study
         from mien.machine.progress import say
+        from mien.pipeline.evaluate import run_sequences
 
-        opened = [open_workspace(folder) for folder in self.workspaces]
+        opened, runs = [open_workspace(folder) for folder in self.workspaces], []
         labels = self._labels(opened)
-        write_study(self.out, [_study_runs(one, labels) for one in opened], self._settings())
+        for one in opened:
+            folders = {label: one.run_dir(label) for label in labels}
+            sequences = {label: (folder, tuple(run_sequences(one, folder))) for label, folder in folders.items()}
+            runs.append(StudyRuns(one.root.resolve().name, sequences))
+        write_study(self.out, runs, self._settings())
         key = self.out.with_name(f"{self.out.stem}.key.json")
         say(f"Look at {self.out} and send it; keep {key}, then: mien study tally {key} ANSWERS.json ...")
 
@@ -115,6 +119,8 @@ class Tally:
 
         if not self.answers:
             raise UserError("no answers to tally; give the files that participants saved, or a folder of them")
+        if not self.key.is_file():
+            raise UserError(f"{self.key}: no such file; give the key that `mien study make` wrote beside the page")
         if self.out is not None:
             check_writable(self.out)
         read_all_answers(self.answers, read_key(self.key))
@@ -135,12 +141,3 @@ class Tally:
 
 
 TASKS = {"make": Make, "tally": Tally}
-
-
-def _study_runs(workspace: Workspace, labels: list[str]) -> "StudyRuns":
-    from mien.lab.analysis.study.making import StudyRuns
-    from mien.pipeline.evaluate import run_sequences
-
-    folders = {label: workspace.run_dir(label) for label in labels}
-    runs = {label: (folder, tuple(run_sequences(workspace, folder))) for label, folder in folders.items()}
-    return StudyRuns(workspace.root.resolve().name, runs)

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 else:
     PresetName = Literal[tuple(PRESETS)]
 
-_MOST_BYTES = 16 << 20
-"""Largest file of settings. A run's config.json has some kilobytes."""
 _TAKEN = ("method", "settings")
 _NOT_TAKEN = ("format", "version", "checksum", "data", "mien", "command_line")
 """Other entries of a run's config.json: what it was trained on, by which version, with which command."""
@@ -42,7 +40,8 @@ def check_method(option: str, name: str) -> None:
         raise UserError(f"{option}: give one of {names} instead of {name!r}, or install the package that adds it")
 
 
-_Elsewhere = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
+Elsewhere = Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress]
+"""A setting that this command has no option for."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +49,13 @@ class Details(TrainSettings):
     """Settings of a training run. Losses, rates and density control are settings of the method."""
 
     # These have options without a prefix.
-    steps: _Elsewhere = None
-    split: _Elsewhere = None
-    background: _Elsewhere = None
-    seed: _Elsewhere = None
-    device: _Elsewhere = None
-    held_out_sequences: _Elsewhere = None
-    held_out_cameras: _Elsewhere = None
+    steps: Elsewhere = None
+    split: Elsewhere = None
+    background: Elsewhere = None
+    seed: Elsewhere = None
+    device: Elsewhere = None
+    held_out_sequences: Elsewhere = None
+    held_out_cameras: Elsewhere = None
 
 
 @dataclass(frozen=True)
@@ -67,9 +66,7 @@ class ConfigFile:
     method: str | None
     """Name of the method, if the file gives one."""
     method_changes: Mapping[str, Any]
-    """The method's settings by name, without `kind`."""
     settings_changes: Mapping[str, Any]
-    """Settings of the run by name."""
     sequences: tuple[str, ...]
     """Sequences that the run of this file was trained on. They are not taken over."""
 
@@ -108,9 +105,6 @@ class TrainOptions:
                                tyro.conf.AvoidSubcommands]  # fmt: skip
     subject: str | None = None
     """Subject of --split gaussian-avatars, for example 306 (default: the number in the workspace's name)."""
-    face_tuning: bool = True
-    """By default, training corrects the tracking, with interpolated corrections for held-out frames. --no-face-tuning
-    keeps the tracking as it is."""
 
     @classmethod
     def of(
@@ -178,11 +172,8 @@ class TrainOptions:
 
     def method_config(self) -> MethodConfig:
         """The method's settings."""
-        config = self.method_settings
-        if not self.face_tuning:
-            config = replace(config, face_tuning=replace(config.face_tuning, enabled=False))
-        config.check()
-        return config
+        self.method_settings.check()
+        return self.method_settings
 
     def say_what_is_ignored(self) -> None:
         """Report the entry of the file that the run does not use (the sequences of its own run), and doubled splits."""
@@ -222,15 +213,11 @@ def read_config_file(path: Path) -> ConfigFile:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if path.is_dir():
-        inside = path / "config.json"
-        raise UserError(f"--config {path}: is a folder; " + (f"give {inside}" if inside.is_file() else "give a file"))
-    if not path.exists():
-        raise UserError(f"--config {path}: no such file; give a json file, such as DIR/runs/NAME/config.json")
     if not path.is_file():
-        raise UserError(f"--config {path}: is not an ordinary file; give a json file")
+        what = "is a folder" if path.is_dir() else "is not an ordinary file" if path.exists() else "no such file"
+        raise UserError(f"--config {path}: {what}; give a json file, such as DIR/runs/NAME/config.json")
     try:
-        text = read_bytes(path, _MOST_BYTES).decode("utf-8-sig")  # editors on Windows write a byte order mark
+        text = read_bytes(path, 16 << 20).decode("utf-8-sig")  # editors on Windows write a byte order mark
         content = parse_json(text, unique_names=True, any_size=True)
     except (OSError, ValueError) as error:
         raise UserError(f"--config {path}: cannot be read as json ({error}); correct it or give another file") from None

@@ -7,10 +7,7 @@ from typing import Annotated
 import tyro
 
 from mien.errors import UserError
-from mien.pipeline.driver import name_driver, name_neutral
-from mien.pipeline.names import check_avatar, check_port, check_viewer
-
-_LOOPBACK = "127.0.0.1"
+from mien.pipeline.names import PORT, check_avatar, check_driver, check_neutral, check_viewer
 
 
 @dataclass(frozen=True)
@@ -26,11 +23,11 @@ class Command:
     neutral: str | None = None
     """The face at rest of --play and of the workspace's sequences, as for `mien drive`: first, calm, model, or a video,
     recording, workspace or sequence folder of the driver at rest."""
-    port: int = 0
-    """Port of the server, from 1 to 65535. 0 means a free one."""
+    port: Annotated[int, PORT] = 0
+    """Port of the server. 0 means a free one."""
     follow: bool = False
     """Show the .mien file anew each time it changes."""
-    host: str = _LOOPBACK
+    host: str = "127.0.0.1"
     """Address to listen on (default: this machine alone). 0.0.0.0 stands for all addresses of this machine."""
     token: bool = True
     """By default, browsers need the token in the printed address. With --no-token, every user of this machine can use
@@ -41,15 +38,16 @@ class Command:
         check_avatar(self.avatar, self.run_name)
         if self.follow and not self.avatar.is_file():
             raise UserError(f"--follow: needs a .mien file, and {self.avatar} is a workspace; leave --follow out")
-        check_port(self.port)
         if self.play is not None:
-            name_driver(Path(self.play), None)
-        name_neutral(self.neutral)
+            check_driver(Path(self.play), None)
+        check_neutral(self.neutral)
         check_viewer()
 
     def run(self) -> None:
         """Load the avatar, and show it until Ctrl-C."""
-        from mien.pipeline.view import Motions, Place, run_viewing_stage
+        from mien.pipeline.view import run_viewing_stage
 
-        motions = Motions(self.play, self.neutral)
-        run_viewing_stage(self.avatar, self.run_name, motions, Place(self.host, self.port, self.token), self.follow)
+        run_viewing_stage(
+            self.avatar, self.run_name, play=self.play, neutral=self.neutral, host=self.host, port=self.port,
+            token=self.token, follow=self.follow,
+        )  # fmt: skip

@@ -18,12 +18,11 @@ from mien.face.params import FaceParams
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.sequence import FOCAL
-from mien.tracking.landmarks.detector_response import LARGEST_TURN, read_response
+from mien.tracking.landmarks.detector_response import LARGEST_TURN, OFFSET_SIGMA, read_response
 from mien.tracking.landmarks.groups import EYE_CORNERS, NOSE, landmark_weights
 from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.landmarks.stages import FIRST_OUTLIER
-from mien.tracking.landmarks.term import LANDMARK_SIGMA
-from mien.tracking.settings import TrackingSettings
+from mien.tracking.landmarks.term import INDEPENDENT_LANDMARKS, LANDMARK_SIGMA
 
 _LIVE_STEP = 0.5  # of a coefficient, over which landmarks count as linear; for joints, in radians, a quarter of that
 _LIVE_OUTLIER = 6.0
@@ -64,9 +63,8 @@ class LandmarkFit:
 
     def __init__(self, model: FaceModel, person: FaceParams) -> None:
         """Prepare the fit. The identity of `person`, one timestep, stands for that of the driver."""
-        settings = TrackingSettings()
         layout = layout_of(model)
-        reduced = reduce_face_model(model, layout, read_response(model, settings.bias_sigma, choose_detector()))
+        reduced = reduce_face_model(model, layout, read_response(model, OFFSET_SIGMA, choose_detector()))
         self._layout = layout
         self.names = layout.names[6:]
         count = len(self.names)
@@ -85,10 +83,10 @@ class LandmarkFit:
         self._lower, self._upper = (bound[6:].numpy() for bound in (layout.lower, layout.upper))
         self._prior = layout.precision[6:, 6:].numpy()
         weights = landmark_weights().numpy()
-        self._weights = weights / weights.sum() * settings.independent_landmarks
+        self._weights = weights / weights.sum() * INDEPENDENT_LANDMARKS
         self._rigid = np.zeros(len(weights))
         self._rigid[list(NOSE + EYE_CORNERS)] = 1.0
-        self._rigid *= settings.independent_landmarks / self._rigid.sum()
+        self._rigid *= INDEPENDENT_LANDMARKS / self._rigid.sum()
         self._sigma = LANDMARK_SIGMA
         self._held = np.zeros(count)
         self._last: Fitted | None = None

@@ -1,4 +1,4 @@
-"""From trackings to aligned trackings, as the command line runs it. What is aligned stays as it is."""
+"""From trackings to aligned trackings. What is aligned stays as it is."""
 
 import hashlib
 import json
@@ -22,7 +22,6 @@ from mien.rotation import axis_angle_from_matrix
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.tracking import Tracking
 from mien.training.alignment import align
-from mien.training.footage.sequence import Sequence
 from mien.training.run import outdated_sequences
 from mien.training.settings import AlignmentSettings, TrainSettings
 
@@ -37,12 +36,7 @@ _HELD_OUT = ("split", "held_out_sequences", "held_out_cameras")
 
 
 def run_alignment_stage(
-    workspace: Workspace,
-    names: list[str],
-    settings: AlignmentSettings,
-    training: TrainSettings,
-    *,
-    keep: bool = False,
+    workspace: Workspace, names: list[str], settings: AlignmentSettings, training: TrainSettings, *, keep: bool = False
 ) -> None:
     """Align the tracked faces of some sequences to a quick avatar, and write the trackings again.
 
@@ -51,31 +45,43 @@ def run_alignment_stage(
     `training` says what the run that follows holds out.
     """
     loaded, face_model = read_together(workspace, names)
-    fingerprint = _fingerprint(loaded, settings, training)
-    found = [_aligned(sequence.tracking) for sequence in loaded]
-    if all(one.get("fingerprint") == fingerprint for one in found):
+    # What the result depends on beside the tracking.
+    choices = {name: value for name, value in asdict(settings).items() if name != "when"} | {"seed": training.seed}
+    choices |= json.loads(json.dumps({name: getattr(training, name) for name in _HELD_OUT}))
+    tracked = [[sequence.name, sequence.tracking.settings.get("fingerprint")] for sequence in loaded]
+    content = json.dumps([_RECIPE, tracked, choices], sort_keys=True)
+    fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
+    earlier = [_aligned(sequence.tracking) for sequence in loaded]
+    if all(one.get("fingerprint") == fingerprint for one in earlier):
         say(f"{', '.join(names)}: the tracking is aligned, nothing to do")
         return
-    if keep and all(found):
-        if any(_held_out(one) != _held_out(_choices(settings, training)) for one in found):
+    if keep and all(earlier):
+        if any(one.get(name) != choices[name] for one in earlier for name in _HELD_OUT):
             say(
                 f"warning: {', '.join(names)}: aligned to an avatar that held out other frames than this run; `mien "
                 f"align {workspace.root}` with this --split and --hold-out aligns again"
             )
         return
-    before = [replace(sequence, tracking=_before(sequence)) for sequence in loaded]
+    places = [workspace.sequence_dir(name) / "tracking" for name in names]
+    before = [replace(one, tracking=_before(one.tracking, place)) for one, place in zip(loaded, places, strict=True)]
     folder = workspace.root / "sequences" / f".alignment-{fingerprint}"
     with hold(*(workspace.sequence_dir(name) for name in names)):
-        for sequence in loaded:
-            _check_unchanged(sequence)
+        for sequence, place in zip(loaded, places, strict=True):
+            now = read_tracking(place).face.tensors()
+            if not all(now[name].equal(tensor) for name, tensor in sequence.tracking.face.tensors().items()):
+                raise UserError(f"{place}: was tracked again in this moment; run the same command again")
         for other in workspace.root.glob("sequences/.alignment-*"):
             if other != folder and other.is_dir():
                 remove_tree(other)  # kept for another tracking or other settings
         say(f"{', '.join(names)}: frames are aligned to a quick avatar, which is trained first")
         faces = align(before, face_model, settings, training, folder)
-        aligned = {"fingerprint": fingerprint, **_choices(settings, training)}
-        for sequence, face in zip(before, faces, strict=True):
-            _write(sequence, face, aligned)
+        for sequence, place, face in zip(before, places, faces, strict=True):
+            tracking = sequence.tracking
+            write_tensors(place / _BEFORE, tracking.face.tensors())
+            aligned = {**tracking.settings, _KEY: {"fingerprint": fingerprint, **choices}}
+            write_tracking(place, replace(tracking, face=face, settings=aligned))
+            turn, shift = _moved(tracking.face, face)
+            say(f"{sequence.name}: aligned; heads turned by {turn:.2f} degrees and moved by {shift:.1f} mm (medians)")
         remove_tree(folder)
     tell_outdated_runs(workspace, _read_trackings(workspace, names), "the tracking before its alignment")
 
@@ -88,26 +94,24 @@ def one_camera(workspace: Workspace, names: list[str]) -> bool:
 def is_trained_on(workspace: Workspace, run: str, names: list[str]) -> bool:
     """Whether a run exists that was trained on the present trackings of some sequences."""
     run_dir = workspace.run_dir(run)
-    if not (run_dir / "config.json").is_file():
-        return False
-    return not outdated_sequences(run_dir, _read_trackings(workspace, names))
+    return (run_dir / "config.json").is_file() and not outdated_sequences(run_dir, _read_trackings(workspace, names))
 
 
 def _read_trackings(workspace: Workspace, names: list[str]) -> dict[str, Tracking]:
     return {name: read_tracking(workspace.sequence_dir(name) / "tracking") for name in names}
 
 
-def _folder(sequence: Sequence) -> Path:
-    assert sequence.folder is not None, "read from a workspace"
-    return sequence.folder / "tracking"
+def _aligned(tracking: Tracking) -> dict[str, Any]:
+    """How a tracking was aligned. It is empty if it was not."""
+    aligned = tracking.settings.get(_KEY)
+    return aligned if isinstance(aligned, dict) else {}
 
 
-def _before(sequence: Sequence) -> Tracking:
+def _before(tracking: Tracking, place: Path) -> Tracking:
     """The tracking before any alignment."""
-    tracking = sequence.tracking
     if not _aligned(tracking):
         return tracking
-    path, remedy = _folder(sequence) / _BEFORE, "`mien track --again`"
+    path, remedy = place / _BEFORE, "`mien track --again`"
     tensors, now = read_tensors(path, remedy), tracking.face.tensors()
     with expect_whole(path, f"run {remedy}"):
         if {name: tensor.shape for name, tensor in tensors.items()} != {name: now[name].shape for name in now}:
@@ -116,47 +120,8 @@ def _before(sequence: Sequence) -> Tracking:
     return replace(tracking, face=face, settings={k: v for k, v in tracking.settings.items() if k != _KEY})
 
 
-def _write(before: Sequence, face: FaceParams, aligned: dict[str, Any]) -> None:
-    tracking, path = before.tracking, _folder(before)
-    write_tensors(path / _BEFORE, tracking.face.tensors())
-    write_tracking(path, replace(tracking, face=face, settings={**tracking.settings, _KEY: aligned}))
-    turn, shift = _moved(tracking.face, face)
-    say(f"{before.name}: aligned; heads turned by {turn:.2f} degrees and moved by {shift:.1f} mm (medians)")
-
-
-def _check_unchanged(sequence: Sequence) -> None:
-    now = read_tracking(_folder(sequence)).face.tensors()
-    if not all(now[name].equal(tensor) for name, tensor in sequence.tracking.face.tensors().items()):
-        raise UserError(f"{_folder(sequence)}: was tracked again in this moment; run the same command again")
-
-
 def _moved(before: FaceParams, after: FaceParams) -> tuple[float, float]:
     """The medians by which heads were turned, in degrees, and moved, in millimetres."""
     turned = axis_angle_from_matrix(before.T_world_head[:, :3, :3].mT @ after.T_world_head[:, :3, :3])
     shift = after.head_translation - before.head_translation
     return float(turned.norm(dim=-1).median()) * 180 / torch.pi, float(shift.norm(dim=-1).median()) * 1000
-
-
-def _choices(settings: AlignmentSettings, training: TrainSettings) -> dict[str, Any]:
-    """Return, as json, what the result depends on beside the tracking."""
-    own = {name: value for name, value in asdict(settings).items() if name != "when"}
-    return own | {"seed": training.seed} | {name: _plain(getattr(training, name)) for name in _HELD_OUT}
-
-
-def _held_out(choices: dict[str, Any]) -> list[Any]:
-    return [choices.get(name) for name in _HELD_OUT]
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _fingerprint(sequences: list[Sequence], settings: AlignmentSettings, training: TrainSettings) -> str:
-    tracked = [[sequence.name, sequence.tracking.settings.get("fingerprint")] for sequence in sequences]
-    content = [_RECIPE, tracked, _choices(settings, training)]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _aligned(tracking: Tracking) -> dict[str, Any]:
-    found = tracking.settings.get(_KEY)
-    return found if isinstance(found, dict) else {}

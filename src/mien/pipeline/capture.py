@@ -13,35 +13,36 @@ from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.terminal import counted
-from mien.pipeline.names import rig_name, sequence_name
+from mien.pipeline.names import rig_name, sequence_names
 
 
 def run_capture_stage(
-    workspace: Workspace, video: Path, name: str | None, settings: CaptureSettings, replace: bool = False
-) -> list[str]:
-    """Capture a video into the workspace; return the names of its sequences, one for each part."""
-    name = sequence_name(video, name)
-    check_writable(workspace.root, folder=True)
-    captures = capture_video_parts(video, workspace.root / "sequences", settings, name, replace)
-    for capture in captures:
-        _report(capture)
-    return [capture.name for capture in captures]
-
-
-def run_calibrated_capture_stage(
     workspace: Workspace,
-    sources: Sequence[Path],
-    calibration: Path,
+    videos: Sequence[Path],
     names: Sequence[str],
+    calibration: Path | None,
     settings: CaptureSettings,
     replace: bool = False,
 ) -> list[str]:
-    """Capture what several calibrated cameras filmed as one sequence, and return its name in a list."""
-    name = rig_name(sources, calibration, names)
+    """Capture videos into the workspace, and return the names of the sequences, one for each part of each video.
+
+    With a calibration, the videos are of several cameras that filmed at once, and become one sequence.
+    """
+    if calibration is not None:
+        name = rig_name(videos, calibration, names)
+        check_writable(workspace.root, folder=True)
+        out = workspace.sequence_dir(name) / "capture"
+        captures = [capture_cameras(videos, calibration, out, name, settings, replace)]
+        _report(captures[0])
+        return [name]
+    captures, names = [], sequence_names(videos, names)
     check_writable(workspace.root, folder=True)
-    out = workspace.sequence_dir(name) / "capture"
-    _report(capture_cameras(sources, calibration, out, name, settings, replace))
-    return [name]
+    for video, name in zip(videos, names, strict=True):
+        parts = capture_video_parts(video, workspace.root / "sequences", settings, name, replace)
+        for part in parts:
+            _report(part)
+        captures += parts
+    return [capture.name for capture in captures]
 
 
 def check_camera_ids(calibration: Path, ids: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mien.avatar.settings import MethodConfig
-from mien.disk.files import file_digest, read_json, write_atomically, write_json
+from mien.disk.files import file_digest, write_atomically, write_json
 from mien.disk.locks import WAIT, hold
 from mien.disk.workspace import COMPARED, Workspace
 from mien.errors import UserError
@@ -39,34 +39,6 @@ _LEAST_MARGIN = 0.3
 
 
 @dataclass(frozen=True)
-class Budget:
-    """How long each method trains on each capture. If both are 0, as long as its preset says."""
-
-    minutes: float = 0.0
-    """Minutes of training. The number of steps is chosen by a trial on this machine."""
-    steps: int = 0
-
-    @property
-    def name(self) -> str:
-        """A part of a run's name."""
-        return f"{self.minutes:g}min" if self.minutes else f"{self.steps}" if self.steps else "full"
-
-
-@dataclass(frozen=True)
-class CompareSettings:
-    """What `mien bench compare` compares."""
-
-    methods: tuple[str, ...]
-    budget: Budget
-    split: Literal["blocks", "tail"]
-    """Held-out frames of workspaces. Reference captures have their own."""
-
-    def run_name(self, method: str) -> str:
-        """The name of a method's run."""
-        return "-".join([COMPARED + method, self.budget.name, *([] if self.split == "blocks" else [self.split])])
-
-
-@dataclass(frozen=True)
 class Subject:
     """A capture on which all methods are trained."""
 
@@ -81,86 +53,85 @@ class Subject:
 
 
 def run_compare_stage(
-    out: Path, workspaces: Items[Workspace], captures: Items[str], settings: CompareSettings, *, as_json: bool
+    out: Path,
+    workspaces: Items[Workspace],
+    captures: Items[str],
+    methods: Items[str],
+    *,
+    minutes: float,
+    steps: int,
+    split: Literal["blocks", "tail"],
+    as_json: bool,
 ) -> None:
     """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
 
     The captures are tracked workspaces, and reference captures, which are drawn, captured and tracked in OUT first.
+    Each method trains for `minutes`, or else `steps`, or else as long as its preset says. `split` is that of
+    workspaces; reference captures have their own.
     """
+    budget = f"{minutes:g}min" if minutes else f"{steps}" if steps else "full"
     references = [reference_named(name) for name in captures]
+    chosen = {"methods": list(methods), "budget": {"minutes": minutes, "steps": steps}, "split": split}
+    rows: list[MethodRow] = []
+    content: dict[str, Any] = {}
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        subjects = [of_workspace(workspace, settings) for workspace in workspaces]
-        rows: list[MethodRow] = []
-        content: dict[str, Any] = {}
-        for subject in (*subjects, *(_of_reference(reference, out, settings) for reference in references)):
-            for method in settings.methods:
+        subjects = [of_workspace(workspace, split) for workspace in workspaces]
+        for subject in (*subjects, *(_of_reference(reference, out) for reference in references)):
+            for method in methods:
                 say(f"== {subject.name}: {method}")
-                rows.append(_row(subject, method, settings, out))
-                content = _write(out, rows, settings)
-    show(json.dumps(content) if as_json else comparison_table(rows))
+                run = "-".join([COMPARED + method, budget, *([] if split == "blocks" else [split])])
+                own = replace(subject.settings, steps=_PRESET.settings_of(method).steps)
+                trials = out / "trials" / subject.name / run
+                own = replace(own, steps=steps_for(subject, _PRESET.config(method), own, minutes, steps, trials))
+                rows.append(_row(subject, method, run, own))
+                content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": list(map(asdict, rows))}
+                content = json.loads(json.dumps(content))
+                write_json(out / "compare.json", _FORMAT, _VERSION, content)
+                write_atomically(out / "compare.md", lambda path: path.write_text(comparison_table(rows), "utf-8"))
+    show(json.dumps({"format": _FORMAT, "version": _VERSION, **content}) if as_json else comparison_table(rows))
     say(f"The table is in {out / 'compare.md'}")
 
 
-def _write(out: Path, rows: Items[MethodRow], settings: CompareSettings) -> dict[str, Any]:
-    chosen = {**asdict(settings), "methods": list(settings.methods)}
-    content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": [asdict(row) for row in rows]}
-    content = json.loads(json.dumps(content))
-    write_json(out / "compare.json", _FORMAT, _VERSION, content)
-    write_atomically(out / "compare.md", lambda path: path.write_text(comparison_table(rows), encoding="utf-8"))
-    return {"format": _FORMAT, "version": _VERSION, **content}
-
-
-def of_workspace(workspace: Workspace, settings: CompareSettings) -> Subject:
+def of_workspace(workspace: Workspace, split: Literal["blocks", "tail"]) -> Subject:
     """The tracked workspace as something to compare on."""
     names = workspace.tracked_names()
     if not names:
         raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
-    held = replace(_PRESET.settings, split=settings.split)
-    return Subject(workspace.root.resolve().name, workspace, names, held)
+    return Subject(workspace.root.resolve().name, workspace, names, replace(_PRESET.settings, split=split))
 
 
-def _of_reference(reference: ReferenceCapture, out: Path, settings: CompareSettings) -> Subject:
+def _of_reference(reference: ReferenceCapture, out: Path) -> Subject:
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
     held = reference_settings(reference, _PRESET.settings)
     return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 
 
-def _row(subject: Subject, method: str, settings: CompareSettings, out: Path) -> MethodRow:
+def _row(subject: Subject, method: str, run: str, settings: TrainSettings) -> MethodRow:
     """Train and score a method on a capture, unless that is done."""
-    workspace, run = subject.workspace, settings.run_name(method)
-    run_dir, config = workspace.run_dir(run), _PRESET.config(method)
-    own = replace(subject.settings, steps=_PRESET.settings_of(method).steps)
-    own = replace(own, steps=steps_for(subject, config, own, settings.budget, out / "trials" / subject.name / run))
-    run_training_stage(workspace, subject.sequences, run, config, own)
+    workspace, run_dir = subject.workspace, subject.workspace.run_dir(run)
+    run_training_stage(workspace, subject.sequences, run, _PRESET.config(method), settings)
     metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
-    summary = read_training_summary(run_dir)
+    summary, unseen = read_training_summary(run_dir), {}
+    if subject.reference is not None and subject.drawn is not None:
+        unseen = score_unseen_views(subject.reference, subject.drawn, workspace, run)
     size = sum(path.stat().st_size for path in (run_dir / "avatar").rglob("*") if path.is_file())
     return MethodRow(
         subject.name, method, run, summary["steps"], summary["seconds"], summary["gaussians"], size,
-        protocol_means(metrics), _unseen(subject, run),
+        protocol_means(metrics), unseen,
     )  # fmt: skip
 
 
-def _unseen(subject: Subject, run: str) -> dict[str, Any]:
-    if subject.reference is None or subject.drawn is None or subject.reference.views is None:
-        return {}
-    known = subject.workspace.run_dir(run) / "unseen_view.json"
-    if known.is_file():
-        return read_json(known, "mien.unseen_view", 1, remedy="delete this file and run the same command again")[
-            "angles"
-        ]
-    return score_unseen_views(subject.reference, subject.drawn, subject.workspace, run)
-
-
-def steps_for(subject: Subject, config: MethodConfig, settings: TrainSettings, budget: Budget, folder: Path) -> int:
-    """The number of steps of a run. A budget of minutes is turned into steps by two trials, which are kept.
+def steps_for(
+    subject: Subject, config: MethodConfig, settings: TrainSettings, minutes: float, steps: int, folder: Path
+) -> int:
+    """The number of steps of a run. Minutes are turned into steps by two trials, which are kept in a folder.
 
     The run is expected to need as much time beside its steps as the trials, and for each step the time that a step of
     the longer trial takes after the length of the shorter one. By then each frame was used once, which takes longest.
     """
-    if not budget.minutes:
-        return budget.steps or settings.steps
+    if not minutes:
+        return steps or settings.steps
     finished = subject.workspace.run_dir(folder.name) / "training.json"
     if finished.is_file():
         return read_training_summary(finished.parent)["steps"]
@@ -171,19 +142,19 @@ def steps_for(subject: Subject, config: MethodConfig, settings: TrainSettings, b
     count = max(FIRST_TRIAL_STEPS, min(pictures, _MOST_FIRST_STEPS))
     took = trial_seconds(sequences, config, replace(settings, steps=count), folder / f"first-{count}-{tracked}")
     rate, began = took / count, 0.0
-    longer = max(2 * count, round(_TRIAL_SHARE * 60 * budget.minutes / rate))
-    if longer * rate < 60 * budget.minutes:
+    longer = max(2 * count, round(_TRIAL_SHARE * 60 * minutes / rate))
+    if longer * rate < 60 * minutes:
         both = trial_seconds(sequences, config, replace(settings, steps=longer), folder / f"second-{longer}-{tracked}")
         rate = min(max((both - took) / (longer - count), _LEAST_MARGIN * both / longer), both / longer)
         began = both - longer * rate
-    steps = max(1, round((60 * budget.minutes - began) / rate))
+    steps = max(1, round((60 * minutes - began) / rate))
     say(
         f"{folder.name}: {1e3 * rate:.1f} ms a step and {began:.1f} s beside the steps in trials, "
-        f"so {steps:,} steps in {budget.minutes:g} minutes"
+        f"so {steps:,} steps in {minutes:g} minutes"
     )
     if steps < pictures:
         say(
-            f"{folder.name}: {budget.minutes:g} minutes are too few steps to see each of {pictures} pictures once, so "
+            f"{folder.name}: {minutes:g} minutes are too few steps to see each of {pictures} pictures once, so "
             "the figures say little; give more --minutes"
         )
     return steps

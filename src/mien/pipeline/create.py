@@ -3,7 +3,6 @@
 import shlex
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 from mien.avatar.files import load_avatar
 from mien.disk.files import write_atomically
@@ -12,15 +11,12 @@ from mien.errors import UserError
 from mien.evaluation.living import FILM, living, write_film
 from mien.formats.format import MotionOptions
 from mien.formats.page import write_page
-from mien.formats.shared.packed import Motion
 from mien.machine.progress import say
 from mien.pages.pages import LIVING_PAGE
 from mien.pipeline.export_run import RunContent
 from mien.training.footage.filmed import read_coverage
 from mien.training.run import read_run_config, run_camera
 
-MOVIE = "me.mp4"
-"""Name of the film in the workspace."""
 _SECONDS = 8.0
 """Length of the filmed motion that the page plays, in seconds."""
 
@@ -37,8 +33,8 @@ def show_film(workspace: Workspace, run: str) -> None:
             if alive is not None:
                 write_film(film, alive)
         if film.is_file():
-            write_atomically(root / MOVIE, lambda aside: _copy(film, aside))
-            say(f"{root / MOVIE}: five seconds of the avatar")
+            write_atomically(root / "me.mp4", lambda aside: shutil.copyfile(film, aside))
+            say(f"{root / 'me.mp4'}: five seconds of the avatar")
     except UserError as error:
         say(f"no film: {error}")
 
@@ -51,9 +47,12 @@ def show_page(workspace: Workspace, run: str) -> None:
     root, run_dir = workspace.root, workspace.run_dir(run)
     try:
         content = RunContent(workspace, run, MotionOptions(read_run_config(run_dir)["data"][0]["sequence"]))
-        page = write_page(
-            root / LIVING_PAGE, content.portable(confidence=False, soft_cut=True), _first_seconds(content.motion())
-        )
+        motion = content.motion()
+        if motion is not None:
+            count, names = max(1, round(_SECONDS * motion.fps)), ("expression", "joints", "head_rotation")
+            first = {name: getattr(motion, name)[:count] for name in (*names, "head_translation")}
+            motion = replace(motion, **first)
+        page = write_page(root / LIVING_PAGE, content.portable(confidence=False, soft_cut=True), motion)
         say(f"{root / LIVING_PAGE}: the living avatar, {page.size / 1e6:.1f} MB; open it in a browser, or send it")
     except UserError as error:
         say(f"no page: {error}")
@@ -69,15 +68,3 @@ def name_next_commands(workspace: Workspace, run: str) -> None:
         (["export", str(root), *which, "--out", "me.glb"], "for Blender and engines"),
     ):
         say(f"Next: {shlex.join(['mien', *command])}   # {does}")
-
-
-def _copy(film: Path, aside: Path) -> None:
-    shutil.copyfile(film, aside)
-
-
-def _first_seconds(motion: Motion | None) -> Motion | None:
-    if motion is None:
-        return None
-    count = max(1, round(_SECONDS * motion.fps))
-    names = ("expression", "joints", "head_rotation", "head_translation")
-    return replace(motion, **{name: getattr(motion, name)[:count] for name in names})

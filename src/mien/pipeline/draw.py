@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,14 +22,6 @@ from mien.runtime.camera_paths import zoom_for_all
 from mien.training.footage.filmed import filmed_words, read_coverage
 from mien.training.run import read_run_config
 from mien.training.whole_head.soft_cut import shares_left
-
-_GLANCE, _FAINT = 128, 0.1
-"""Largest side of the small pictures that tell where an avatar is, in pixels, and the opacity that counts."""
-
-
-def view(options: PictureOptions, camera: Camera, zoom: float = 1.0) -> Camera:
-    """The camera for pictures of the chosen size."""
-    return camera.fitted(*options.shape(), zoom)
 
 
 @torch.no_grad()
@@ -65,12 +56,12 @@ def draw(options: PictureOptions, gaussians: Gaussians, camera: Camera, closing:
 
 @torch.no_grad()
 def whole(camera: Camera, gaussians: Gaussians) -> Camera:
-    """The camera, or one that shows more if its picture cuts the avatar off."""
-    side = _GLANCE / max(camera.width, camera.height)
+    """The camera, or one that shows more if its picture cuts the avatar off, which a small picture tells."""
+    side = 128 / max(camera.width, camera.height)
     size = max(8, round(side * camera.width)), max(8, round(side * camera.height))
 
     def drawn(zoom: float) -> Bool[np.ndarray, "h w"]:
-        return rasterize(gaussians, camera.fitted(*size, zoom)).alpha.numpy() > _FAINT
+        return rasterize(gaussians, camera.fitted(*size, zoom)).alpha.numpy() > 0.1
 
     zoom = zoom_for_all(drawn)
     return camera if zoom == 1 else camera.fitted(camera.width, camera.height, zoom)
@@ -78,7 +69,12 @@ def whole(camera: Camera, gaussians: Gaussians) -> Camera:
 
 def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> None:
     """Warn if transparent pictures are asked for but the run was trained over white."""
-    if options.background == "transparent" and _trained_over_white(read_run_config(run_dir)["settings"], avatar):
+    if options.background != "transparent":
+        return
+    settings = read_run_config(run_dir)["settings"]
+    # `auto` is random where avatar and settings can fill sides.
+    may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
+    if settings.get("background") == "white" or (settings.get("background") == "auto" and not may_fill):
         say(
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "
             "`mien train --background random` avoids that"
@@ -89,10 +85,3 @@ def sides_filmed(run_dir: Path, avatar: Avatar) -> str | None:
     """How far to each side the head was filmed, in words, if that is known. Beyond, it is completed."""
     covered, model = read_coverage(run_dir, avatar.face_model), avatar.face_model
     return None if covered is None else filmed_words(model, model.head_vertices(avatar.subject)[0].detach(), covered)
-
-
-def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
-    """Whether a run had a white background. `auto` is random where avatar and settings can fill sides."""
-    background = settings.get("background")
-    may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
-    return background == "white" or (background == "auto" and not may_fill)

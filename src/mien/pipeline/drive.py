@@ -1,8 +1,7 @@
-"""From an avatar and a motion to pictures, as the command line runs it."""
+"""From an avatar and a motion to pictures."""
 
 import hashlib
 import itertools
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.files import file_digest, write_atomically
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving.drivers import Driver, read_recording, read_tracked_driver, with_neutral
+from mien.driving.follower import FollowOptions
 from mien.driving.rest import facing, rest_of
 from mien.driving.transfer import drive, keep_to_filmed
 from mien.face.cache import cache_folder, cache_is_kept
@@ -24,9 +24,8 @@ from mien.media.pictures import side_by_side
 from mien.media.source import FrameSelection, list_images, open_source
 from mien.media.writing import write_pictures
 from mien.pipeline.capture import run_capture_stage
-from mien.pipeline.draw import draw, posed_softly, view, warn_of_white
-from mien.pipeline.driver import NamedDriver, name_driver, name_neutral
-from mien.pipeline.names import is_picture
+from mien.pipeline.draw import draw, posed_softly, warn_of_white
+from mien.pipeline.names import NEUTRALS, check_driver, check_neutral, is_picture, kind_of
 from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.track import run_tracking_stage
 from mien.tracking.settings import TrackingSettings
@@ -43,36 +42,38 @@ def open_driver(
 ) -> Driver:
     """Open a driver: a workspace, a recording (csv, json, voice), or a film.
 
-    A film is a video, a picture or a folder of pictures. It is captured, tracked and kept in the cache.
-
-    Args:
-        by: The workspace or file.
-        sequence: Name of a sequence of the workspace. For a video with cuts: one part instead of all parts in a row.
-        face_model: The avatar's face model.
-        fps: Frame rate of the timecode in a csv.
-        neutral: The driver's face at rest, as `--neutral` names it (`mien.driving.drivers.with_neutral`).
-        capture: How a film is captured.
+    A film is a video, a picture or a folder of pictures. It is captured (by `capture`), tracked and kept in the cache.
+    `sequence` is one of a workspace, or a part of a film with cuts, all of which otherwise follow each other; `fps` is
+    the rate of a csv's timecode; `neutral` is the driver's face at rest, as `--neutral` names it (`with_neutral`).
     """
-    named, rest = name_driver(by, sequence, fps, capture), name_neutral(neutral)
-    driver = _open(named, face_model)
-    if neutral is None and named.kind == "film" and by.is_file() and is_picture(by):
+    check_neutral(neutral)
+    driver, other = _open(by, face_model, sequence, fps, capture), None
+    if neutral is None and by.is_file() and kind_of(by) == "film" and is_picture(by):
         say(f"{by}: is one picture, so its motion is measured from the face model's neutral")
         neutral = "model"
-    other = _open(rest, face_model) if isinstance(rest, NamedDriver) else None
+    if neutral is not None and neutral not in NEUTRALS:
+        other = _open(Path(neutral), face_model)
     return with_neutral(driver, face_model, neutral, str(by), other)
 
 
-def _open(named: NamedDriver, face_model: FaceModel) -> Driver:
-    if named.kind == "recording":
-        return read_recording(named.path, face_model, named.fps)
-    if named.kind == "sequence":
-        return read_tracked_driver([named.path], face_model)
-    if named.kind == "film":
-        workspace, names = tracked_film(named.path, face_model.name, named.capture)
+def _open(
+    by: Path,
+    face_model: FaceModel,
+    sequence: str | None = None,
+    fps: float | None = None,
+    capture: CaptureSettings | None = None,
+) -> Driver:
+    kind, names = check_driver(by, sequence, fps, capture), None
+    if kind == "recording":
+        return read_recording(by, face_model, fps)
+    if kind == "sequence":
+        return read_tracked_driver([by], face_model)
+    if kind == "film":
+        workspace, names = tracked_film(by, face_model.name, capture)
     else:
-        workspace, names = open_workspace(named.path), None
-    if names is None or named.sequence is not None:
-        names = [workspace.pick_sequence(named.sequence)]
+        workspace = open_workspace(by)
+    if names is None or sequence is not None:
+        names = [workspace.pick_sequence(sequence)]
     return read_tracked_driver([workspace.sequence_dir(name) for name in names], face_model)
 
 
@@ -98,7 +99,7 @@ def tracked_film(
         for index, picture in enumerate(each for each in pictures for _ in range(_FEWEST)):
             content = picture.read_bytes()
             write_atomically(source / f"{index}{picture.suffix}", partial(Path.write_bytes, data=content))
-    run_capture_stage(workspace, source, None, settings)
+    run_capture_stage(workspace, [source], (), None, settings)
     # The parts of a video with cuts are numbered: NAME-10 comes after NAME-2.
     tracked = run_tracking_stage(workspace, face_model_name, TrackingSettings(), overlay="none")
     names = sorted(tracked, key=lambda name: (len(name), name))
@@ -107,46 +108,41 @@ def tracked_film(
     return workspace, names
 
 
-@dataclass(frozen=True)
-class DriveOptions:
-    """How the avatar follows the driver, and what is shown."""
-
-    sequence: str | None = None
-    """Name of the driver's sequence."""
-    head_pose: bool = True
-    alone: bool = False
-    fps: float | None = None
-    """Frame rate of the timecode in a csv."""
-    unlimited: bool = False
-    """Whether the avatar follows also beyond what was filmed."""
-    neutral: str | None = None
-    """The driver's face at rest, as `--neutral` names it."""
-    capture: CaptureSettings | None = None
-    """How a driver that is filmed is captured."""
-
-
 def run_driving_stage(
-    run_dir: Path, by: Path, out: Path, options: DriveOptions | None = None, picture: PictureOptions | None = None
+    run_dir: Path,
+    by: Path,
+    out: Path,
+    picture: PictureOptions | None = None,
+    follow: FollowOptions | None = None,
+    *,
+    sequence: str | None = None,
+    fps: float | None = None,
+    neutral: str | None = None,
+    capture: CaptureSettings | None = None,
+    alone: bool = False,
 ) -> None:
-    """Render a run's avatar as it follows a driver. Pictures of the driver are beside it, unless `alone` is set."""
-    options, picture = options or DriveOptions(), picture or PictureOptions()
+    """Render a run's avatar as it follows a driver (`open_driver`).
+
+    Pictures of the driver are beside it, unless `alone` is set.
+    """
+    follow, picture = follow or FollowOptions(), picture or PictureOptions()
     # The number of frames is known only after tracking, but a video or numbered pictures take any number.
     output = picture.plan(out, 2)
     avatar = load_avatar(run_dir)
     warn_of_white(picture, run_dir, avatar)
-    driver = open_driver(by, options.sequence, avatar.face_model, options.fps, options.neutral, options.capture)
+    driver = open_driver(by, sequence, avatar.face_model, fps, neutral, capture)
     bounds, filmed_by = avatar.face_model.expression_bounds, run_camera(run_dir)
     person = rest_of(avatar.subject, avatar.face_model, facing(filmed_by.viewmat)).face
-    driven = drive(driver.face, driver.at_rest, person, bounds, options.head_pose, str(by))
+    driven = drive(driver.face, driver.at_rest, person, bounds, follow.head_pose, str(by))
     if output.kind == "sequence":
         plan_output(out, len(driven), output.transparent)
-    camera = view(picture, filmed_by)
-    if not options.unlimited:
+    camera = filmed_by.fitted(*picture.shape())
+    if not follow.unlimited:
         filmed = filmed_range(run_dir, avatar)
         driven, softened = keep_to_filmed(driven, filmed, avatar.subject, bounds, camera.position)
         if softened:
             say(f"{softened} of {len(driven)} frames go beyond what was filmed and are softened; --unlimited lets go")
-    beside = None if options.alone or output.transparent else driver.pictures
+    beside = None if alone or output.transparent else driver.pictures
     pose = posed_softly(avatar)
 
     def frame(timestep: int) -> np.ndarray:

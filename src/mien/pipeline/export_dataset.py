@@ -127,11 +127,12 @@ def _trained(workspace: Workspace, run_dir: Path, avatar: Avatar, person: Path) 
 def _write(folder: Path, task: Task, avatar: Avatar) -> None:
     subject = avatar.subject
     face = replace(task.face, identity=subject.identity, vertex_offsets=subject.vertex_offsets)
+    (folder / task.sequence).mkdir(parents=True, exist_ok=True)
     for serial, camera in task.cameras.items():
-        path, title = folder / task.sequence / f"cam_{serial}.mp4", f"{task.sequence}, camera {serial}"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        title = f"{task.sequence}, camera {serial}"
         pictures = track_progress(_pictures(avatar, face, camera, title), title, len(face))
-        write_video(path, pictures, task.fps, 14)  # the quality that the benchmark asks for
+        # The quality that the benchmark asks for.
+        write_video(folder / task.sequence / f"cam_{serial}.mp4", pictures, task.fps, 14)
 
 
 @torch.no_grad()

@@ -18,9 +18,7 @@ from mien.pipeline.names import no_model_file
 from mien.tracking.landmarks.embedding import EmbeddingSettings, embed_landmarks
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 
-FIRST_PICTURES = 80
-"""Number of pictures in the first round, when lips and brows are not known. The second round paints these, and uses the
-number in `EmbeddingSettings`."""
+FIRST_PICTURES = 80  # of the first round, when lips and brows are not known; the second round paints these
 
 
 def face_model_of(choice: str) -> FaceModel:

@@ -1,21 +1,17 @@
-"""An avatar that follows a camera, in a viewer and as a video, as the command line runs it."""
+"""An avatar that follows a camera, in a viewer and as a video."""
 
 import contextlib
 import queue
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from mien import runtime
-from mien.avatar.baking import as_array
-from mien.camera import Camera
 from mien.disk.files import cannot_write
 from mien.driving.follower import FollowOptions
 from mien.errors import UserError
@@ -25,42 +21,52 @@ from mien.media.pictures import side_by_side
 from mien.media.pixels import to_rgb
 from mien.media.video import write_video
 from mien.pipeline.picture_options import PictureOptions
-from mien.pipeline.view import Place, Viewed, open_viewed
+from mien.pipeline.view import open_viewed
 from mien.pipeline.view_motions import switch_of
+from mien.runtime.camera_paths import fitted
 from mien.viewer.access import Door
-from mien.viewer.following import CameraSwitch
-from mien.viewer.server import serve
+from mien.viewer.camera import CameraSwitch
+from mien.viewer.server import address_of, listen, serve
 from mien.viewer.session import Seen, Session
 
 FPS = 25
 """Frames a second of a recording."""
-_QUALITY = 23
 _WAIT_SECONDS = 0.2
 
 
-@dataclass(frozen=True)
-class CameraOptions:
-    """How a camera is followed, and where that is shown."""
+def run_following_stage(
+    avatar: Path,
+    run: str | None,
+    name: CameraName,
+    follow: FollowOptions,
+    picture: PictureOptions,
+    out: Path | None = None,
+    alone: bool = False,
+    port: int | None = None,
+) -> None:
+    """Show an avatar that follows a camera, until Ctrl-C; with a recording of a file, until the file ends.
 
-    follow: FollowOptions
-    picture: PictureOptions
-    out: Path | None = None
-    """The recording."""
-    alone: bool = False
-    """Whether the recording shows only the avatar."""
-    place: Place | None = None
-    """Where the viewer listens. None for no viewer."""
-
-
-def run_following_stage(avatar: Path, run: str | None, name: CameraName, options: CameraOptions) -> None:
-    """Show an avatar that follows a camera, until Ctrl-C; with a recording of a file, until the file ends."""
+    `out` records it, without the camera's pictures beside the avatar if `alone`. Without a port, there is no viewer.
+    """
     viewed = open_viewed(avatar, run)
     session = Session(runtime.Avatar(viewed.portable), viewed.mesh)
-    switch = switch_of(session, viewed, name, options.follow, again=options.out is None)
+    switch = switch_of(session, viewed, name, follow, again=out is None)
     try:
         switch.start()
-        with _recording(switch, session, options) as recorder:
-            _wait(switch, session, viewed, options, recorder)
+        with contextlib.ExitStack() as closing:
+            recorder = None if out is None else _Recorder(session, switch, picture, out, alone)
+            if recorder is not None:
+                closing.callback(recorder.finish)
+            ask = "look into the camera for a second with a relaxed face; Ctrl-C ends"
+            if port is None:
+                say(ask[0].upper() + ask[1:])
+                while not switch.ended and (recorder is None or recorder.running):
+                    time.sleep(_WAIT_SECONDS)
+            else:
+                door = Door.of("127.0.0.1")
+                listener = closing.enter_context(contextlib.closing(listen(door.host, port)))
+                say(f"Open {address_of(door, listener)} in a browser, and {ask}")
+                serve(session, door, listener, viewed.portable.about.name, switch)
     except KeyboardInterrupt:
         pass
     finally:
@@ -72,58 +78,30 @@ def run_following_stage(avatar: Path, run: str | None, name: CameraName, options
         raise switch.error
 
 
-def _wait(
-    switch: CameraSwitch, session: Session, viewed: Viewed, options: CameraOptions, recorder: "_Recorder | None"
-) -> None:
-    def ready(address: str) -> None:
-        say(f"Open {address} in a browser, and look into the camera for a second with a relaxed face; Ctrl-C ends")
-
-    if options.place is not None:
-        door = Door.of(options.place.host, options.place.token)
-        serve(session, door, options.place.port, viewed.portable.about.name, ready, switch)
-        return
-    say("Look into the camera for a second with a relaxed face; Ctrl-C ends")
-    while not switch.ended and (recorder is None or recorder.running):
-        time.sleep(_WAIT_SECONDS)
-
-
-@contextlib.contextmanager
-def _recording(switch: CameraSwitch, session: Session, options: CameraOptions) -> "Iterator[_Recorder | None]":
-    if options.out is None:
-        yield None
-        return
-    recorder = _Recorder(session, switch, options, options.out)
-    switch.watch = recorder.take
-    try:
-        yield recorder
-    finally:
-        recorder.finish()
-        say(f"{options.out}: {recorder.pictures} frames")
-
-
 class _Recorder:
     """Draws each followed frame in a thread, or the newest if it is slow, and writes the pictures at their times."""
 
-    def __init__(self, session: Session, switch: CameraSwitch, options: CameraOptions, out: Path) -> None:
-        self._session, self._switch, self._options, self._out = session, switch, options, out
+    def __init__(self, session: Session, switch: CameraSwitch, options: PictureOptions, out: Path, alone: bool) -> None:
+        self._session, self._switch, self._options, self._out, self._alone = session, switch, options, out, alone
         self._newest: queue.Queue[tuple[runtime.Face, Seen] | None] = queue.Queue(maxsize=1)
-        given = session.avatar.camera
-        camera = Camera(torch.from_numpy(given.K), torch.from_numpy(given.viewmat), given.width, given.height)
-        wanted = camera.fitted(*options.picture.shape())
-        self._camera = runtime.Camera(as_array(wanted.K), as_array(wanted.viewmat), wanted.width, wanted.height)
+        self._camera = fitted(session.avatar.camera, *options.shape())
         self.pictures = 0
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="mien-recording", daemon=True)
         self._thread.start()
+        switch.watch = self._take
 
     @property
     def running(self) -> bool:
         """Whether frames are still taken."""
         return self._thread.is_alive()
 
-    def take(self, seen: Seen) -> None:
+    def _take(self, seen: Seen) -> None:
         """Record the face that is shown now. An older one that is not drawn yet is dropped."""
-        self._put((self._session.face, seen))
+        with contextlib.suppress(queue.Empty):
+            self._newest.get_nowait()
+        with contextlib.suppress(queue.Full):
+            self._newest.put_nowait((self._session.face, seen))
 
     def finish(self) -> None:
         """Write the end of the video."""
@@ -135,16 +113,11 @@ class _Recorder:
         self._thread.join()
         if self._error is not None:
             raise self._error
-
-    def _put(self, item: tuple[runtime.Face, Seen]) -> None:
-        with contextlib.suppress(queue.Empty):
-            self._newest.get_nowait()
-        with contextlib.suppress(queue.Full):
-            self._newest.put_nowait(item)
+        say(f"{self._out}: {self.pictures} frames")
 
     def _run(self) -> None:
         try:
-            write_video(self._out, self._frames(), FPS, _QUALITY, "ultrafast")
+            write_video(self._out, self._frames(), FPS, 23, "ultrafast")
         except UserError as error:
             self._error = error
         except OSError as error:
@@ -164,8 +137,8 @@ class _Recorder:
 
     def _picture(self, face: runtime.Face, seen: Seen) -> UInt8[np.ndarray, "h w 3"]:
         gaussians = runtime.pose(self._session.avatar.portable.baked, face)
-        shown = to_rgb(runtime.render(gaussians, self._camera, self._options.picture.color())[0])
-        if self._options.alone:
+        shown = to_rgb(runtime.render(gaussians, self._camera, self._options.color())[0])
+        if self._alone:
             return shown
         height, width = seen.picture.shape[:2]
         wide = max(1, round(width * len(shown) / height))

@@ -16,7 +16,7 @@ from mien.camera import Camera, camera_from_fov, look_at
 from mien.capture.from_cameras import capture_cameras
 from mien.capture.from_video import capture_video
 from mien.capture.settings import CaptureSettings
-from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence, TrackedSequence, TrainedAvatar
+from mien.datasets.dataset import Dataset, Findings, Footage, ReadSequence, TrackedSequence, TrainedAvatar
 from mien.datasets.writing import OVERLAY, write_sequence
 from mien.disk.files import write_atomically
 from mien.disk.inside import inside, remove_tree
@@ -33,28 +33,16 @@ from mien.tracking.settings import TrackingSettings
 from mien.training.run import BUSY_REMEDY, write_imported_run
 from mien.training.settings.splits import write_own_split
 
-_DISTANCE = 1.2
-"""Distance of the camera from the middle of the head, in metres."""
-_SIDE = 512
-_MARGIN = 1.15
-"""Size of the picture relative to the largest extent of the head's mesh."""
-
 
 def run_import_stage(
     dataset: Dataset, path: Path, workspace: Workspace, run: str, face_model: str | None, retrack: bool = False,
     resume: bool = False, corrects_colors: bool = True,
 ) -> None:  # fmt: skip
-    """Read a dataset, and write its avatar as a run, or its sequences.
+    """Read a dataset, and write its avatar as the run `run`, or its sequences.
 
-    Args:
-        dataset: The dataset.
-        path: Its files.
-        workspace: The workspace.
-        run: Name of the run that an avatar becomes.
-        face_model: Name or file of the face model that the files belong to, if the user gives one.
-        retrack: Whether to leave out the tracking of the authors, and to track the pictures with mien.
-        resume: Whether sequences that are there already stay as they are. If not, they are an error.
-        corrects_colors: Whether the colours of videos are corrected, if the dataset has such a correction.
+    `face_model` is the name or file of the model that the files belong to. With `retrack`, the tracking of the authors
+    is left out, and mien tracks the pictures. With `resume`, sequences that are there already stay as they are.
+    Without `corrects_colors`, colours of videos stay as filmed.
     """
     run_dir = workspace.run_dir(run)
     if dataset.holds == "avatar":
@@ -65,32 +53,24 @@ def run_import_stage(
     else:
         content = dataset.read(path, None if face_model is None else face_model_of(face_model))
     if isinstance(content, TrainedAvatar):
-        _write_run(content, run_dir, path)
-    else:
-        if not corrects_colors:
-            content = map(_as_filmed, content)
-        untracked = _write_sequences(content, workspace, dataset, path, resume)
-        if retrack:
-            run_tracking_stage(workspace, "anny", TrackingSettings())
-        elif untracked:
-            say(f"{', '.join(untracked)}: without a tracking; run `mien track {shlex.quote(str(workspace.root))}`")
-
-
-def _as_filmed(sequence: ReadSequence) -> ReadSequence:
-    return replace(sequence, color_corrections=None) if isinstance(sequence, Footage) else sequence
-
-
-def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
-    avatar, face = content.avatar, content.face
-    with hold(run_dir, remedy=BUSY_REMEDY):
-        check_new_run(run_dir)  # another process may have written it meanwhile
-        try:
-            write_imported_run(run_dir, avatar, face, front_camera(avatar), source)
-        except BaseException:
-            remove_tree(run_dir)
-            raise
-    count = counted(len(avatar.gaussian_store()), "Gaussian")
-    say(f"{run_dir}: {count} on {avatar.face_model.name}, {counted(len(face), 'timestep')}")
+        avatar, face = content.avatar, content.face
+        with hold(run_dir, remedy=BUSY_REMEDY):
+            check_new_run(run_dir)  # another process may have written it meanwhile
+            try:
+                write_imported_run(run_dir, avatar, face, front_camera(avatar), path)
+            except BaseException:
+                remove_tree(run_dir)
+                raise
+        count = counted(len(avatar.gaussian_store()), "Gaussian")
+        say(f"{run_dir}: {count} on {avatar.face_model.name}, {counted(len(face), 'timestep')}")
+        return
+    if not corrects_colors:
+        content = (replace(one, color_corrections=None) if isinstance(one, Footage) else one for one in content)
+    untracked = _write_sequences(content, workspace, dataset, path, resume)
+    if retrack:
+        run_tracking_stage(workspace, "anny", TrackingSettings())
+    elif untracked:
+        say(f"{', '.join(untracked)}: without a tracking; run `mien track {shlex.quote(str(workspace.root))}`")
 
 
 def _write_sequences(
@@ -99,28 +79,28 @@ def _write_sequences(
     """Write the sequences, and return the names of those without a tracking."""
     untracked, overlays = [], []
     for sequence in sequences:
-        if isinstance(sequence, Footage):
-            folder = workspace.sequence_dir(sequence.name)
-            with hold(folder):
-                if not (resume and folder.exists()):
-                    check_new_sequence(folder)
+        name = sequence.name if isinstance(sequence, Footage) else sequence.capture.name
+        folder = workspace.sequence_dir(name)
+        with hold(folder):
+            is_there = resume and folder.exists()
+            if not is_there:
+                check_new_sequence(folder)
+                if isinstance(sequence, Footage):
                     write_footage(folder, sequence, dataset, source)
-            untracked.append(sequence.name)
+                else:
+                    write_sequence(folder, sequence, dataset, source)
+        if isinstance(sequence, Footage):
+            untracked.append(name)
+        if is_there or isinstance(sequence, Footage):
             continue
         capture = sequence.capture
-        folder = workspace.sequence_dir(capture.name)
-        with hold(folder):
-            if resume and folder.exists():
-                continue
-            check_new_sequence(folder)
-            write_sequence(folder, sequence, dataset, source)
-        cameras = counted(len(capture.camera_ids), "camera")
         tracked = f", tracked on {sequence.face_model.name}" if isinstance(sequence, TrackedSequence) else ""
+        cameras = counted(len(capture.camera_ids), "camera")
         say(f"{folder}: {counted(capture.timesteps, 'timestep')}, {cameras}{tracked}")
         if tracked:
             overlays.append(folder / OVERLAY)
         else:
-            untracked.append(capture.name)
+            untracked.append(name)
     if overlays:
         more = f", and {len(overlays) - 1} more" * (len(overlays) > 1)
         say(f"the imported mesh over some pictures: {overlays[0]}{more}; look at it before you train")
@@ -129,16 +109,15 @@ def _write_sequences(
 
 @torch.no_grad()
 def front_camera(avatar: Avatar) -> Camera:
-    """A camera in front of the person at rest that shows the whole mesh."""
-    subject = avatar.subject
+    """A camera 1.2 m in front of the person at rest that shows the whole mesh."""
+    subject, distance, side = avatar.subject, 1.2, 512
     vertices = avatar.face_model.head_vertices(subject)[0]
     middle, pose = (vertices.amin(0) + vertices.amax(0)) / 2, subject.T_world_head[0]
-    in_front = middle + torch.tensor([0.0, 0.0, _DISTANCE])
+    in_front = middle + torch.tensor([0.0, 0.0, distance])
     position, target = (pose[:3, :3] @ point + pose[:3, 3] for point in (in_front, middle))
-    extent = float((vertices.amax(0) - vertices.amin(0)).max())
-    return camera_from_fov(
-        2 * math.atan(0.5 * _MARGIN * extent / _DISTANCE), _SIDE, _SIDE, look_at(position, target, pose[:3, 1])
-    )
+    extent = 1.15 * float((vertices.amax(0) - vertices.amin(0)).max())  # with a margin
+    view = look_at(position, target, pose[:3, 1])
+    return camera_from_fov(2 * math.atan(0.5 * extent / distance), side, side, view)
 
 
 def write_footage(folder: Path, footage: Footage, dataset: Dataset, source: Path) -> None:
@@ -201,17 +180,15 @@ def _capture_rig(out: Path, footage: Footage, cameras: Mapping[str, Camera], sou
             raise UserError(told) from None
 
 
-_MAX_CLIPS = 12
-"""Most sequences that are listed one by one."""
-
-
 def findings_lines(findings: Findings, face_model_is_given: bool = True, corrects_colors: bool = True) -> list[str]:
     """Return the sequences, the face model, the split, the colours and what is missing, a line each."""
-    clips = findings.clips
-    lines = [f"  {_clip_line(clip)}" for clip in clips[:_MAX_CLIPS]]
-    if len(clips) > _MAX_CLIPS:
-        lines.append(f"  and {counted(len(clips) - _MAX_CLIPS, 'more sequence')}")
-    lines = [f"  one person, {counted(len(clips), 'sequence')}", *lines]
+    clips, most = findings.clips, 12
+    lines = [f"  one person, {counted(len(clips), 'sequence')}"]
+    for clip in clips[:most]:
+        frames = "as many frames as its videos" if clip.frames is None else counted(clip.frames, "frame")
+        lines.append(f"  {clip.name}: {frames}, {counted(clip.cameras, 'camera')}")
+    if len(clips) > most:
+        lines.append(f"  and {counted(len(clips) - most, 'more sequence')}")
     remedy = "" if face_model_is_given or findings.face_model is None else "; give yours with --face-model"
     lines.append(f"  face model: {findings.face_model or 'none, or none that can be used'}{remedy}")
     lines.append(f"  split: {findings.split or 'none'}")
@@ -219,8 +196,3 @@ def findings_lines(findings: Findings, face_model_is_given: bool = True, correct
         told = findings.color_correction if corrects_colors else "left out (--no-color-correction)"
         lines.append(f"  colour correction: {told}")
     return lines + [f"  missing or not used: {each}" for each in findings.missing]
-
-
-def _clip_line(clip: Clip) -> str:
-    frames = "as many frames as its videos" if clip.frames is None else counted(clip.frames, "frame")
-    return f"{clip.name}: {frames}, {counted(clip.cameras, 'camera')}"

@@ -1,21 +1,37 @@
-"""Checks of what people name, before any work: avatars, videos, sequences, runs, and what a viewer needs."""
+"""Checks of what people name, before any work: videos, sequences, runs, avatars, drivers, and what a viewer needs."""
 
 import importlib.util
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from itertools import combinations
 from pathlib import Path
+from typing import Literal
 
+from mien.capture.settings import CaptureSettings
+from mien.disk.config import Range
 from mien.disk.files import file_digest
 from mien.disk.inside import is_plain_name
-from mien.disk.workspace import check_no_workspace, open_workspace
+from mien.disk.workspace import check_no_workspace, is_workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.terminal import plain_name
+from mien.media.output import SOUND_ENDINGS
+
+PORT = Range(0, 65_535)
+"""Allowed ports of a viewer."""
+Kind = Literal["recording", "film", "sequence", "workspace"]
+"""A file of another program or a voice; a video, a picture or a folder of pictures; the folder of a tracked sequence;
+or a workspace."""
+NEUTRALS = ("first", "calm", "model")
+"""Words that --neutral takes. Anything else is a file."""
+_DRIVERS = (
+    "a workspace, a video, a picture, a folder of pictures, a .csv of Live Link Face or of ARKit's names, a .json of "
+    "blend shapes, or a sound file"
+)
 
 
-def sequence_name(video: Path, name: str | None) -> str:
-    """`name`, or the video's name without its ending (with "_" for control characters), if a folder can have it."""
-    name = plain_name(video.stem) if name is None else name
+def run_name(name: str) -> str:
+    """The name of a run or a sequence, if a folder can have it."""
     if not is_plain_name(name):
         raise UserError(f"{name!r} cannot be the name of a folder; give another with --name or --run")
     return name
@@ -33,30 +49,41 @@ def check_new_sequence(folder: Path) -> None:
         raise UserError(f"{folder}: is there already; delete it to import it again, or import into another workspace")
 
 
-def run_name(name: str) -> str:
-    """`name`, if a folder can have it."""
-    return sequence_name(Path(name), name)
-
-
 def sequence_names(videos: Sequence[Path], names: Sequence[str]) -> list[str]:
-    """A name for each video: the given names, or else the names of the videos."""
-    if not videos:
-        raise UserError("no video given; write mien create VIDEO [VIDEO ...] --out DIR")
-    for video in videos:
-        if not video.exists():
-            raise UserError(f"{video}: no such video or folder of pictures; check the path")
+    """A name for each video: the given names, or else the names of the videos (with "_" for control characters)."""
     if names and len(names) != len(videos):
         counts = f"{len(names)} names, but the number of videos is {len(videos)}"
         raise UserError(f"--name {' '.join(names)}: {counts}; give one name for each")
-    found = [sequence_name(video, name) for video, name in zip(videos, names or [None] * len(videos), strict=True)]
+    found = [run_name(name) for name in names or [plain_name(video.stem) for video in videos]]
     twice = [name for name, count in Counter(found).items() if count > 1]
     if twice:
         raise UserError(f"two videos would both be the sequence {twice[0]!r}; give each a name with --name")
     return found
 
 
-def check_videos(videos: Sequence[Path]) -> None:
-    """Check that files are videos, before anything heavy is loaded. Folders of pictures are left to the capture."""
+def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
+    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder."""
+    if not calibration.is_file():
+        what = "is a folder" if calibration.is_dir() else "no such file"
+        raise UserError(f"--calibration {calibration}: {what}; give the json file of its cameras (docs/using.md)")
+    if len(names) > 1:
+        raise UserError(f"--name {' '.join(names)}: all cameras together become one sequence; give one name")
+    if not names and len(sources) > 1:
+        raise UserError("--calibration: several videos become one sequence; name it with --name")
+    return run_name(names[0] if names else plain_name(sources[0].resolve().stem))
+
+
+def check_sources(videos: Sequence[Path], names: Sequence[str], calibration: Path | None) -> None:
+    """Check videos and names before anything heavy is loaded. Folders of pictures are left to the capture."""
+    if not videos:
+        raise UserError("no video given; name a video, or with --calibration those of all cameras or their folder")
+    for video in videos:
+        if not video.exists():
+            raise UserError(f"{video}: no such video or folder of pictures; check the path")
+    if calibration is None:
+        sequence_names(videos, names)
+    else:
+        rig_name(videos, calibration, names)
     for video in videos:
         check_no_workspace(video)
         if video.is_file() and is_picture(video):
@@ -69,24 +96,6 @@ def is_picture(file: Path) -> bool:
 
     with open_video(file) as (container, _):
         return container.format.name.endswith("_pipe")  # FFmpeg's names of pictures: png_pipe, jpeg_pipe.
-
-
-def rig_name(sources: Sequence[Path], calibration: Path, names: Sequence[str]) -> str:
-    """The name of the sequence that several calibrated cameras filmed: the given name, or that of their folder."""
-    if calibration.is_dir():
-        raise UserError(f"--calibration {calibration}: is a folder; give the json file of its cameras (docs/using.md)")
-    if not calibration.is_file():
-        raise UserError(f"--calibration {calibration}: no such file; name a json file of cameras (docs/using.md)")
-    if not sources:
-        raise UserError("--calibration: name the videos of its cameras, or a folder that holds them")
-    for source in sources:
-        if not source.exists():
-            raise UserError(f"{source}: no such video or folder of pictures; check the path")
-    if len(names) > 1:
-        raise UserError(f"--name {' '.join(names)}: all cameras together become one sequence; give one name")
-    if not names and len(sources) > 1:
-        raise UserError("--calibration: several videos become one sequence; name it with --name")
-    return sequence_name(sources[0].resolve(), names[0] if names else None)
 
 
 def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Sequence[str]) -> Iterator[str]:
@@ -108,11 +117,8 @@ def doubled_videos(videos: Sequence[Path], names: Sequence[str], held_out: Seque
 
 
 def _same_content(first: Path, second: Path) -> bool:
-    if first.samefile(second):
-        return True
-    if not (first.is_file() and second.is_file()) or first.stat().st_size != second.stat().st_size:
-        return False
-    return file_digest(first) == file_digest(second)
+    files = first.is_file() and second.is_file() and first.stat().st_size == second.stat().st_size
+    return first.samefile(second) or (files and file_digest(first) == file_digest(second))
 
 
 def no_model_file(path: Path) -> str:
@@ -136,12 +142,6 @@ def check_avatar(avatar: Path, run: str | None) -> None:
         open_workspace(avatar).pick_run(run)
 
 
-def check_port(port: int) -> None:
-    """Check the port of a viewer."""
-    if not 0 <= port <= 65_535:
-        raise UserError(f"--port {port}: give a number from 1 to 65535, or 0 for a free one")
-
-
 def has_viewer() -> bool:
     """Whether the package of the viewer's page is installed."""
     return importlib.util.find_spec("viser") is not None
@@ -151,3 +151,67 @@ def check_viewer() -> None:
     """Check that the package of the viewer's page is installed."""
     if not has_viewer():
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
+
+
+def check_driver(
+    by: Path, sequence: str | None = None, fps: float | None = None, capture: CaptureSettings | None = None
+) -> Kind:
+    """Classify what `--by` or `--neutral` names, and check before any work that it exists and fits the options.
+
+    `sequence` is one of a workspace, or a part of a film with cuts; `fps` is the rate of a csv's timecode; `capture`
+    says how a film is captured.
+    """
+    suffix, usual = by.suffix.lower() if by.is_file() else "", CaptureSettings()
+    if fps is not None and (suffix != ".csv" or not 0 < fps <= 1000):
+        raise UserError(f"--fps {fps:g}: is for the times of a .csv; give a number above 0, at most 1000")
+    if not by.exists():
+        raise UserError(f"{by}: no such file or folder; give {_DRIVERS}")
+    kind, settings = kind_of(by), capture or usual
+    if kind == "recording" and sequence is not None:
+        raise UserError(f"--sequence {sequence}: {by} has no sequences; leave --sequence out")
+    if kind != "film" and settings != usual:
+        name = next(one.name for one in fields(usual) if getattr(settings, one.name) != getattr(usual, one.name))
+        option = f"--capture.{'no-' * (getattr(settings, name) is False)}{name.replace('_', '-')}"
+        raise UserError(f"{option}: is for a video or pictures, and --by is {by}; leave {option} out")
+    settings.check()
+    if kind == "workspace":
+        open_workspace(by).pick_sequence(sequence)
+    elif kind == "film" and by.is_file():
+        from mien.media.video_file import open_video
+
+        try:
+            with open_video(by):
+                pass
+        except UserError as error:
+            raise UserError(f"{error}; what drives an avatar is {_DRIVERS}") from None
+        with open_video(by, settings.stream):
+            pass
+    return kind
+
+
+def check_neutral(neutral: str | None) -> None:
+    """Check before any work that a driver's face at rest is a word of `NEUTRALS`, or a driver."""
+    if neutral is None or neutral in NEUTRALS:
+        return
+    if not Path(neutral).exists():
+        raise UserError(
+            f"--neutral {neutral}: no such file; give first, calm or model, or a video, recording, workspace or "
+            "sequence folder of the driver at rest"
+        )
+    check_driver(Path(neutral))
+
+
+def kind_of(by: Path) -> Kind:
+    """What something is that drives an avatar."""
+    if by.is_file():
+        return "recording" if by.suffix.lower() in (".csv", ".json", *SOUND_ENDINGS) else "film"
+    if (by / "tracking").is_dir():
+        return "sequence"
+    if is_workspace(by):
+        return "workspace"
+    from mien.media.source import list_images
+
+    try:
+        return "film" if list_images(by) else "workspace"
+    except UserError:
+        return "workspace"

@@ -36,11 +36,8 @@ class PictureOptions:
 
         wide, high = self.shape()
         if not (_MIN_SIDE <= wide <= MAX_SIDE and _MIN_SIDE <= high <= MAX_SIDE):
-            is_square = wide == high == self.size
-            given = (
-                f"--size {self.size}: give a number" if is_square else f"--width {wide} --height {high}: give numbers"
-            )
-            raise UserError(f"{given} from {_MIN_SIDE} to {MAX_SIDE}")
+            given = f"--size {self.size}" if wide == high == self.size else f"--width {wide} --height {high}"
+            raise UserError(f"{given}: give numbers from {_MIN_SIDE} to {MAX_SIDE}")
         self.color()
         return plan_output(out, frames, self.background == "transparent")
 

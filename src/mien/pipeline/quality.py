@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mien.avatar.methods import method_named
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture, read_capture_hash
 from mien.disk.files import read_json, replace_folder, write_atomically, write_json
@@ -22,11 +21,11 @@ from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
-from mien.evaluation.metrics_file import protocol_means, read_metrics
+from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
-from mien.lab.benchmarking.quality import QualityRow, TrackingErrors, markdown_table, tracking_errors
+from mien.lab.benchmarking.quality import QualityRow, markdown_table, tracking_errors
 from mien.lab.benchmarking.unseen_views import (
     Figures,
     SidePictures,
@@ -44,7 +43,7 @@ from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.evaluate import run_evaluation_stage, run_sequences
 from mien.pipeline.track import run_tracking_stage
 from mien.pipeline.train import run_training_stage
-from mien.tracking.files import read_tracking, write_tracking
+from mien.tracking.files import write_tracking
 from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.tracking.settings import TrackingSettings
@@ -54,78 +53,63 @@ from mien.training.run import read_training_summary
 from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 
 _FORMAT, _VERSION = "mien.bench_quality", 1
-_TIMES = "seconds.json"
-_FACE_MODEL = "anny"
-_SHEET_SIDE, _SHEET_FRAMES = 192, 6
-_SCORED = EvaluationSettings(perceptual_frames=8, video_frames=0)
-_UNSEEN = ScoreSettings(perceptual_frames=2)
+_SCORED, _PRESET = EvaluationSettings(perceptual_frames=8, video_frames=0), PRESETS["standard"]
 
 
 def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
     """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png."""
     usual = [name for name, reference in REFERENCES.items() if reference.by_default]
-    references = [reference_named(name) for name in captures or usual]
-    method_named(method)
+    references, rows, strips = [reference_named(name) for name in captures or usual], [], []
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        rows = _walk(references, out, method, steps)
+        for reference in references:
+            row, strip = _run_reference(reference, out, method, steps or reference.steps)
+            rows.append(row)
+            strips.append(strip)
+            content = {"rows": [asdict(row) for row in rows]}
+            write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
+            write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), "utf-8"))
+            write_png(out / "contact_sheet.png", np.concatenate(strips))
     show(json.dumps([asdict(row) for row in rows]) if as_json else markdown_table(rows))
     say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
-def _walk(references: list[ReferenceCapture], out: Path, method: str, steps: int) -> list[QualityRow]:
-    rows, strips = [], []
-    for reference in references:
-        row, strip = run_reference(reference, out, method, steps or reference.steps)
-        rows.append(row)
-        strips.append(strip)
-        content = {"rows": [asdict(row) for row in rows]}
-        write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
-        write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), encoding="utf-8"))
-        write_png(out / "contact_sheet.png", np.concatenate(strips))
-    return rows
-
-
-def run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
+def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
     """Run all stages on one reference capture and skip those with current results; return its row and its pictures.
 
     Frames of one camera are aligned as `mien create` does.
     """
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
-    times = StageTimes(workspace.root / _TIMES)
+    times = StageTimes(workspace.root / "seconds.json")
     say(f"== {reference.name}: {reference.description}")
     key, trackings = draw_and_track(reference, drawn, workspace, times)
-    run = f"{method}-{steps}"
-    settings = reference_settings(reference, replace(PRESETS["standard"].settings_of(method), steps=steps))
+    names, run = list(trackings), f"{method}-{steps}"
+    settings = reference_settings(reference, replace(_PRESET.settings_of(method), steps=steps))
     alignment = AlignmentSettings()
-    if steps >= alignment.template_steps and one_camera(workspace, list(trackings)):
+    if steps >= alignment.template_steps and one_camera(workspace, names):
         with times.measured("align"):
-            run_alignment_stage(workspace, list(trackings), alignment, settings, keep=True)
+            run_alignment_stage(workspace, names, alignment, settings, keep=True)
     with times.measured("train"):
-        run_training_stage(workspace, list(trackings), run, PRESETS["standard"].config(method), settings)
+        run_training_stage(workspace, names, run, _PRESET.config(method), settings)
     with times.measured("evaluate"):
-        scored = (workspace.run_dir(run) / "metrics.json").is_file()
-        metrics = read_metrics(workspace.run_dir(run)) if scored else run_evaluation_stage(workspace, run, _SCORED)
-    errors = {name: _errors(workspace, drawn, name) for name in trackings}
-    summary = read_training_summary(workspace.run_dir(run))
+        metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
+    errors = {
+        name: tracking_errors(
+            tracking, read_capture(workspace.sequence_dir(name) / "capture"), read_truth(drawn / name / "truth"),
+            load_face_model(tracking.face_model),
+        )
+        for name, tracking in trackings.items()
+    }  # fmt: skip
     with times.measured("views"):
         unseen = score_unseen_views(reference, drawn, workspace, run)
     by_truth: Figures = {}
     if reference.views is not None:
         with times.measured("views by true tracking"):
-            true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), list(trackings))
-            run_training_stage(true, list(trackings), run, PRESETS["standard"].config(method), settings)
+            true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), names)
+            run_training_stage(true, names, run, _PRESET.config(method), settings)
             by_truth = score_unseen_views(reference, drawn, true, run)
+    gaussians = read_training_summary(workspace.run_dir(run))["gaussians"]
     row = QualityRow(
-        reference.name,
-        key,
-        method,
-        steps,
-        summary["gaussians"],
-        protocol_means(metrics),
-        errors,
-        times.seconds,
-        unseen,
-        by_truth,
+        reference.name, key, method, steps, gaussians, protocol_means(metrics), errors, times.seconds, unseen, by_truth
     )
     return row, _strip(workspace, run)
 
@@ -140,10 +124,13 @@ def draw_and_track(
     with times.measured("draw"):
         key = reference.write(drawn)
     with times.measured("capture"):
-        for recipe in reference.sequences:
-            _capture(workspace, drawn / recipe.name, recipe.name)
+        for name in (recipe.name for recipe in reference.sequences):
+            if (video := drawn / name / "video.mp4").is_file():
+                run_capture_stage(workspace, [video], [name], None, CaptureSettings(cuts=False), replace=True)
+            else:
+                _copy_capture(drawn / name / "capture", workspace.sequence_dir(name))
     with times.measured("track"):
-        return key, run_tracking_stage(workspace, _FACE_MODEL, TrackingSettings(), overlay="none")
+        return key, run_tracking_stage(workspace, "anny", TrackingSettings(), overlay="none")
 
 
 def reference_settings(reference: ReferenceCapture, settings: TrainSettings) -> TrainSettings:
@@ -168,47 +155,42 @@ def _workspace_of_truth(drawn: Path, workspace: Workspace, true: Workspace, name
             write_tracking(folder / "tracking", truth)
             scoring = make_scoring(read_capture(own), truth, load_face_model(truth.face_model), scratch=folder)
             write_scoring(folder / "scoring", scoring, pictures)
-            # The capture comes last: it says that the rest is there.
-            shutil.copytree(own, folder / ".capture.partial", dirs_exist_ok=True)
-            replace_folder(folder / "capture", folder / ".capture.partial")
+        _copy_capture(own, folder)  # it comes last: it says that the rest is there
     return true
 
 
 def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Workspace, run: str) -> Figures:
-    """Score a run on true pictures from all sides, if there are any. Writes a sheet and a chart beside its report."""
-    views = reference.views
+    """Score a run on true pictures from all sides, if there are any. Writes a sheet and a chart beside its report.
+
+    What was scored is read.
+    """
+    views, run_dir = reference.views, workspace.run_dir(run)
     if views is None:
         return {}
-    run_dir = workspace.run_dir(run)
+    file = run_dir / "unseen_view.json"
+    if file.is_file():
+        return read_json(file, "mien.unseen_view", 1, remedy=f"delete {file} and run the same command again")["angles"]
     experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
     capture, truth = read_capture(drawn / views.name / "capture"), read_truth(drawn / views.name / "truth")
     moments = tuple(views.first + views.every * index for index in range(capture.timesteps))
-    figures, sheet = score_side_views(experiment, views.sequence, SidePictures(capture, truth, moments), _UNSEEN)
+    figures, sheet = score_side_views(
+        experiment, views.sequence, SidePictures(capture, truth, moments), ScoreSettings(perceptual_frames=2)
+    )
     write_png(run_dir / "unseen_view.png", sheet)
     write_unseen_chart(run_dir / "unseen_view_chart.svg", figures)
-    write_json(run_dir / "unseen_view.json", "mien.unseen_view", 1, {"angles": figures})
+    write_json(file, "mien.unseen_view", 1, {"angles": figures})
     return figures
 
 
-def _capture(workspace: Workspace, drawn: Path, name: str) -> None:
-    """Capture a drawn video like a user's video, or copy the capture of calibrated cameras."""
-    if (drawn / "video.mp4").is_file():
-        run_capture_stage(workspace, drawn / "video.mp4", name, CaptureSettings(cuts=False), replace=True)
+def _copy_capture(source: Path, folder: Path) -> None:
+    """Copy the capture of calibrated cameras into the folder of a sequence, unless it is there."""
+    aside, target = folder / ".capture.partial", folder / "capture"
+    if target.is_dir() and read_capture_hash(target) == read_capture_hash(source):
         return
-    target = workspace.sequence_dir(name) / "capture"
-    if target.is_dir() and read_capture_hash(target) == read_capture_hash(drawn / "capture"):
-        return
-    aside = target.with_name(".capture.partial")
-    with hold(workspace.sequence_dir(name)):
+    with hold(folder):
         remove_tree(aside)
-        shutil.copytree(drawn / "capture", aside)
+        shutil.copytree(source, aside)
         replace_folder(target, aside)
-
-
-def _errors(workspace: Workspace, drawn: Path, name: str) -> TrackingErrors:
-    folder = workspace.sequence_dir(name)
-    tracking, truth = read_tracking(folder / "tracking"), read_truth(drawn / name / "truth")
-    return tracking_errors(tracking, read_capture(folder / "capture"), truth, load_face_model(tracking.face_model))
 
 
 class StageTimes:
@@ -236,13 +218,13 @@ def _strip(workspace: Workspace, run: str) -> np.ndarray:
     """Head crops of held-out pictures in a row, above those of the avatar."""
     run_dir = workspace.run_dir(run)
     experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
-    frames = experiment.held_out_frames
+    frames, count = experiment.held_out_frames, 6
     # Choose at random: evenly spread frames of several cameras could show one camera again and again.
-    places = np.random.default_rng(0).choice(len(frames), _SHEET_FRAMES, replace=len(frames) < _SHEET_FRAMES)
+    places = np.random.default_rng(0).choice(len(frames), count, replace=len(frames) < count)
     chosen = [frames[index] for index in np.sort(places)]
 
     def tile(picture: torch.Tensor, frame: Frame) -> np.ndarray:
-        return in_white_square(crop_to(picture, experiment.crop(frame)), _SHEET_SIDE)
+        return in_white_square(crop_to(picture, experiment.crop(frame)), 192)
 
     return np.concatenate([
         np.concatenate([tile(draw(experiment, frame), frame) for frame in chosen], 1)

@@ -24,20 +24,8 @@ TURNTABLE_TILES = 9
 """Number of angles on a sheet of a turntable."""
 MAX_TILES = 120
 """Largest number of expressions on a sheet. Face models with more show the first ones."""
-_WIDEST = 1800
-"""Width in pixels that a sheet of several columns stays below."""
 SMALL_TILE = 288
 """Width and height of the pictures on a sheet of expressions without --size, in pixels."""
-_GLANCE, _FAINT, _MARGIN = 0.25, 24, 0.04
-"""Size of the pictures that tell where the head is, as a share of the tile's; the difference to the background from
-which a pixel belongs to it, of 255; and what stays free around it, as a share of the tile."""
-_GAP = 4
-_BAR, _SMALLEST_BAR = 0.09, 22
-"""Height of the bar with a name, as a part of the picture's width, and at least, in pixels."""
-_FONT, _LETTERS = cv2.FONT_HERSHEY_SIMPLEX, 0.021
-"""The font, and its scale per pixel of the bar's height."""
-_DARK, _LIGHT = (40, 40, 40), (225, 225, 225)
-"""Colours of names over light and dark backgrounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,18 +92,17 @@ def nearer_tiles(
     picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]],
     background: tuple[int, int, int],
 ) -> list[Tile]:
-    """The same tiles, magnified alike so that what they show fills them but for a margin.
+    """The same tiles, magnified alike so that what they show fills them but for a margin of 4 %.
 
-    They are made smaller only where the filmed frame cuts the head off.
-
-    Small pictures of all tiles tell where that is.
+    They are made smaller only where the filmed frame cuts the head off. Pictures of a quarter of the size tell where it
+    is: a pixel belongs to it that differs from the background by more than 24 of 255.
     """
     first = tiles[0].camera
-    width, height = (max(1, round(side * _GLANCE)) for side in (first.width, first.height))
+    width, height = (max(1, round(side / 4)) for side in (first.width, first.height))
 
     def drawn(zoom: float) -> Bool[np.ndarray, "h w"]:
         glances = [picture(tile.face, tile.camera.fitted(width, height, zoom)) for tile in tiles]
-        return np.any([np.abs(one.astype(int) - background).max(-1) > _FAINT for one in glances], axis=0)
+        return np.any([np.abs(one.astype(int) - background).max(-1) > 24 for one in glances], axis=0)
 
     zoom = zoom_for_all(drawn)
     shown = drawn(zoom)
@@ -124,17 +111,17 @@ def nearer_tiles(
     left, top, wide, high = cv2.boundingRect(shown.astype(np.uint8))
     if not wide:
         return list(tiles)
-    scale = max(1.0, (1 - 2 * _MARGIN) * min(width / wide, height / high))
-    x = _inside((left + wide / 2) / width * first.width, first.width, scale)
-    y = _inside((top + high / 2) / height * first.height, first.height, scale)
-    shift, size = (scale * (x - first.width / 2), scale * (y - first.height / 2)), (first.width, first.height)
-    return [replace(tile, camera=tile.camera.fitted(*size, scale).cropped(*shift, *size)) for tile in tiles]
+    scale = max(1.0, (1 - 2 * 0.04) * min(width / wide, height / high))
 
+    def shift(center: float, side: int) -> float:
+        """The shift of a magnified picture along one side, such that nothing beyond the picture is shown."""
+        half = side / scale / 2
+        return scale * (min(max(center * side, half), side - half) - side / 2)
 
-def _inside(center: float, side: int, scale: float) -> float:
-    """The centre of a magnified picture along one side, moved so that nothing beyond the picture is shown."""
-    half = side / scale / 2
-    return min(max(center, half), side - half)
+    x = shift((left + wide / 2) / width, first.width)
+    y = shift((top + high / 2) / height, first.height)
+    size = first.width, first.height
+    return [replace(tile, camera=tile.camera.fitted(*size, scale).cropped(x, y, *size)) for tile in tiles]
 
 
 def draw_sheet(
@@ -142,25 +129,26 @@ def draw_sheet(
     picture: Callable[[FaceParams, Camera], UInt8[np.ndarray, "h w 3"]],
     background: tuple[int, int, int] = (WHITE, WHITE, WHITE),
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """All tiles in rows as even as possible, each above its name, over the colour of their background."""
+    """All tiles in rows as even as possible, each above its name, in a sheet of several columns below 1,800 pixels."""
     named = [named_picture(picture(tile.face, tile.camera), tile.name, background) for tile in tiles]
-    most = max((_WIDEST + _GAP) // (named[0].shape[1] + _GAP), 1)
+    gap = 4
+    most = max((1800 + gap) // (named[0].shape[1] + gap), 1)
     rows = math.ceil(len(named) / most)
-    return picture_grid(named, math.ceil(len(named) / rows), _GAP, background)
+    return picture_grid(named, math.ceil(len(named) / rows), gap, background)
 
 
 def named_picture(
     picture: UInt8[np.ndarray, "h w 3"], name: str, background: tuple[int, int, int] = (WHITE, WHITE, WHITE)
 ) -> UInt8[np.ndarray, "_ w 3"]:
     """A picture with its name below, in letters that fit the picture's size. A name that is too wide is smaller."""
-    wide = picture.shape[1]
-    high = max(_SMALLEST_BAR, round(_BAR * wide))
+    wide, font = picture.shape[1], cv2.FONT_HERSHEY_SIMPLEX
+    high = max(22, round(0.09 * wide))
     bar = np.full((high, wide, 3), background, np.uint8)
-    size, thick = _LETTERS * high, max(1, round(high / 24))
-    (length, _), _ = cv2.getTextSize(name, _FONT, size, thick)
+    size, thick = 0.021 * high, max(1, round(high / 24))
+    (length, _), _ = cv2.getTextSize(name, font, size, thick)
     size *= min(1.0, (wide - 8) / max(length, 1))
-    ink = _DARK if sum(background) > 3 * WHITE / 2 else _LIGHT
-    cv2.putText(bar, name, (4, round(0.68 * high)), _FONT, size, ink, thick, cv2.LINE_AA)
+    ink = (40, 40, 40) if sum(background) > 3 * WHITE / 2 else (225, 225, 225)
+    cv2.putText(bar, name, (4, round(0.68 * high)), font, size, ink, thick, cv2.LINE_AA)
     return np.concatenate([picture, bar])
 
 

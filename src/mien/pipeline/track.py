@@ -1,4 +1,4 @@
-"""From captures to trackings, as the command line runs it. Current trackings are read back."""
+"""From captures to trackings. Current trackings are read back."""
 
 import hashlib
 import json
@@ -8,7 +8,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
-from mien.capture.capture import Capture
 from mien.capture.store import read_capture, read_capture_hash
 from mien.datasets.writing import OVERLAY
 from mien.disk.files import remove_leftovers
@@ -69,16 +68,19 @@ def run_tracking_stage(
     names = workspace.sequence_names()
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
-    check_apart(names, hold_out)
+    _check_apart(names, hold_out)
     check_masks(workspace, names, scoring)
-    finished = (
-        None
-        if again
-        else _finished_trackings(workspace, names, face_model, settings, overlay if show else None, hold_out)
-    )
-    if finished is not None:
-        say(f"{', '.join(finished)}: the tracking is current, nothing to do")
-        return finished
+    with suppress(UserError):  # it is reported when the results are written again
+        fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
+        trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model, tell=False)
+        folders = [] if trackings is None else [(workspace.sequence_dir(name), one) for name, one in trackings.items()]
+        if trackings is not None and all(
+            scoring_exists(folder / "scoring", read_capture_hash(folder / "capture"))
+            and (not show or all(_is_shown(folder, tracking, overlay)))
+            for folder, tracking in folders
+        ):
+            say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
+            return trackings
     with hold(*(workspace.sequence_dir(name) for name in names)):
         fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model)
@@ -86,7 +88,8 @@ def run_tracking_stage(
             trackings = _track(workspace, names, face_model, settings, fingerprint, preview, hold_out)
         else:
             say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
-        _write_masks(workspace, trackings, face_model, scoring)
+        for name, tracking in trackings.items():
+            _write_masks(workspace.sequence_dir(name), name, tracking, face_model, scoring)
         if show:
             for name, tracking in trackings.items():
                 show_tracking(workspace.sequence_dir(name), tracking, face_model, overlay)
@@ -103,7 +106,7 @@ def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overla
             show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
 
 
-def check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
+def _check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
     """Check that the sequences to track apart exist, and that others remain."""
     unknown = [name for name in hold_out if name not in names]
     if unknown:
@@ -123,43 +126,18 @@ def check_masks(workspace: Workspace, names: Collection[str], scoring: ScoringSe
         check_scoring_cut(folder / "scoring", scoring, capture_hash)
 
 
-def _finished_trackings(
-    workspace: Workspace,
-    names: list[str],
-    face_model: FaceModel,
-    settings: TrackingSettings,
-    overlay: Overlay | None,
-    hold_out: Collection[str],
-) -> dict[str, Tracking] | None:
-    """The trackings, if all results of the stage exist and are current. Without `overlay`, reports do not count."""
-    try:
-        fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
-        trackings = _current_trackings(workspace, names, fingerprint, face_model, tell=False)
-        for name, tracking in (trackings or {}).items():
-            folder = workspace.sequence_dir(name)
-            if not scoring_exists(folder / "scoring", read_capture_hash(folder / "capture")):
-                return None
-            if overlay is not None and not all(_is_shown(folder, tracking, overlay)):
-                return None
-    except UserError:  # reported when the results are written again
-        return None
-    return trackings
-
-
-def _write_masks(
-    workspace: Workspace, trackings: Mapping[str, Tracking], face_model: FaceModel, scoring: ScoringSettings
-) -> None:
-    """Write scoring masks that are missing or outdated."""
-    for name, tracking in trackings.items():
-        folder = workspace.sequence_dir(name)
-        capture_hash = read_capture_hash(folder / "capture")
-        if not scoring_exists(folder / "scoring", capture_hash):
-            if scoring_exists(folder / "scoring"):
-                say(f"{name}: the pictures changed, so the scoring mask is made again")
-            capture = read_capture(folder / "capture")
-            check_tracking_of(capture, tracking, folder / "tracking")
-            made = make_scoring(capture, tracking, face_model, scratch=folder, settings=scoring)
-            write_scoring(folder / "scoring", made, capture_hash)
+def _write_masks(folder: Path, name: str, tracking: Tracking, face_model: FaceModel, scoring: ScoringSettings) -> None:
+    """Write the scoring masks of a sequence, if they are missing or outdated."""
+    capture_hash = read_capture_hash(folder / "capture")
+    if scoring_exists(folder / "scoring", capture_hash):
+        return
+    if scoring_exists(folder / "scoring"):
+        say(f"{name}: the pictures changed, so the scoring mask is made again")
+    capture = read_capture(folder / "capture")
+    check_tracking_of(capture, tracking, folder / "tracking")
+    write_scoring(
+        folder / "scoring", make_scoring(capture, tracking, face_model, scratch=folder, settings=scoring), capture_hash
+    )
 
 
 def tracking_fingerprint(
@@ -229,7 +207,7 @@ def _track(
         say(f"{name}: left out, because too few of its frames show a face")
     apart = {name: capture for name, capture in usable.items() if name in hold_out}
     shaping = {name: capture for name, capture in usable.items() if name not in hold_out}
-    check_apart(list(usable), list(apart))
+    _check_apart(list(usable), list(apart))
     keep = workspace.root / "sequences" / f".tracking-{fingerprint}"
     for other in workspace.root.glob("sequences/.tracking-*"):
         if other != keep and other.is_dir():
@@ -273,34 +251,27 @@ def show_tracking(folder: Path, tracking: Tracking, face_model: FaceModel, overl
     reported, shown = _is_shown(folder, tracking, overlay)
     if reported and shown:
         return
-    capture: Capture = read_capture(folder / "capture")
-    check_tracking_of(capture, tracking, folder / "tracking")
+    place, capture = folder / "tracking", read_capture(folder / "capture")
+    check_tracking_of(capture, tracking, place)
     if not reported:
-        findings = write_residual_report(folder / "tracking", capture, tracking, face_model)
-        say(f"{capture.name}: {findings} See {folder / 'tracking' / 'report.html'}")
+        findings = write_residual_report(place, capture, tracking, face_model)
+        say(f"{capture.name}: {findings} See {place / 'report.html'}")
     if not shown:
-        every = _stride(tracking, overlay)
+        count, every = len(tracking.valid), _stride(tracking, overlay)
         if every > 1:
-            say(f"{capture.name}: the overlay shows one frame in {every} of {len(tracking.valid)}; `--overlay all` "
-                "shows them all")  # fmt: skip
-        video = folder / "tracking" / "overlay.mp4"
-        remove_leftovers(video)
-        write_overlay(video, capture, tracking, face_model, every)
+            say(f"{capture.name}: the overlay shows one frame in {every} of {count}; `--overlay all` shows them all")
+        remove_leftovers(place / "overlay.mp4")
+        write_overlay(place / "overlay.mp4", capture, tracking, face_model, every)
 
 
 def _is_shown(folder: Path, tracking: Tracking, overlay: Overlay) -> tuple[bool, bool]:
     """Whether the residual report and the chosen overlay exist and are newer than the tracking."""
     video, report, written = (folder / "tracking" / name for name in ("overlay.mp4", "report.html", "tracking.json"))
-    if overlay == "none":
-        return _is_newer(report, written), True
+    reported, newer = (path.is_file() and path.stat().st_mtime >= written.stat().st_mtime for path in (report, video))
     frames = len(range(0, len(tracking.valid), _stride(tracking, overlay)))
-    return _is_newer(report, written), _is_newer(video, written) and count_frames(video) == frames
+    return reported, overlay == "none" or (newer and count_frames(video) == frames)
 
 
 def _stride(tracking: Tracking, overlay: Overlay) -> int:
     """The n for which the overlay shows every n-th frame."""
     return overlay_stride(len(tracking.valid)) if overlay == "auto" else 1
-
-
-def _is_newer(path: Path, than: Path) -> bool:
-    return path.is_file() and path.stat().st_mtime >= than.stat().st_mtime

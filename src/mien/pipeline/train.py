@@ -10,7 +10,7 @@ from mien.disk.workspace import Workspace
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.machine.progress import say
-from mien.pipeline.live_view import LiveView
+from mien.pipeline.view_training import TrainingView
 from mien.training.footage.sequence import Sequence, read_sequence
 from mien.training.run import check_untouched, is_finished, read_training_summary
 from mien.training.settings import TrainSettings
@@ -70,7 +70,7 @@ def run_training_stage(
     with ExitStack() as closing:
         if not is_finished(run_dir):
             say(f"{run}: looks for what the pictures show of the head, before the first step")
-        live = LiveView(run, loaded[0].tracking.cameras[0]) if view else None
+        live = TrainingView(run, loaded[0].tracking.cameras[0]) if view else None
         if live is not None:
             closing.callback(live.close)
         train(loaded, face_model, method, settings, run_dir, watch=live)

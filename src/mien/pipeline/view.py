@@ -1,6 +1,6 @@
-"""From a workspace or a .mien file to a viewer, as the command line runs it.
+"""From a workspace or a .mien file to a viewer.
 
-A .mien file is shown without torch. What needs it, workspaces and motions, is in `viewing_motions` beside this.
+A .mien file is shown without torch. What needs it, workspaces and motions, is in `view_motions` beside this.
 """
 
 import contextlib
@@ -22,8 +22,8 @@ from mien.media.camera_names import devices
 from mien.runtime.baked import MeshBound, PortableAvatar
 from mien.runtime.file import read_portable
 from mien.viewer.access import Door, is_loopback
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import Mesh
-from mien.viewer.following import CameraSwitch
 from mien.viewer.server import address_of, listen, serve
 from mien.viewer.session import Session
 
@@ -39,74 +39,54 @@ class Viewed:
 
     portable: PortableAvatar
     mesh: Mesh | None
-    sequences: dict[str, Path]
-    """Names of the workspace's tracked sequences, and the workspace."""
+    sequences: list[str]
+    """Names of the workspace's tracked sequences."""
     person: Callable[[], "tuple[mien.face.FaceModel, mien.face.FaceParams]"]
     """Returns the face model and the person at rest, which motions need."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a viewer listens."""
-
-    host: str
-    port: int
-    """0 means a free one."""
-    token: bool = True
-    """Whether browsers need a token."""
-
-
-@dataclass(frozen=True)
-class Motions:
-    """Which motions a viewer offers besides the workspace's own."""
-
-    play: str | None = None
-    """What `mien drive --by` takes."""
-    neutral: str | None = None
-    """The face at rest of all motions, as `--neutral` names it."""
-    at_once: bool = False
-    """Whether the motion plays as soon as the viewer opens."""
-    capture: CaptureSettings | None = None
-    """How `play` is captured if it is filmed."""
-
-
-def run_viewing_stage(avatar: Path, run: str | None, motions: Motions, place: Place, follow: bool = False) -> None:
+def run_viewing_stage(
+    avatar: Path,
+    run: str | None,
+    *,
+    play: str | None = None,
+    neutral: str | None = None,
+    capture: CaptureSettings | None = None,
+    at_once: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    token: bool = True,
+    follow: bool = False,
+) -> None:
     """Show an avatar in browsers until Ctrl-C. With `follow`, show its file anew each time it changes.
 
-    The address is told at once. Browsers that open it wait until the avatar is loaded.
+    `play` is a motion besides those of the workspace, as `mien drive --by` takes it; `at_once` plays it as soon as the
+    viewer opens. `neutral` is the face at rest of all motions. The address is told at once: browsers that open it wait.
     """
-    door = Door.of(place.host, place.token)
-    with contextlib.closing(listen(place.host, place.port)) as listener:
+    door = Door.of(host, token)
+    with contextlib.closing(listen(host, port)) as listener:
         viewed = viewed_file(avatar) if avatar.is_file() else None  # takes no time, unlike the run of a workspace
         say(f"Open {address_of(door, listener)} in a browser; Ctrl-C ends the viewer")
         try:
-            viewed = viewed or open_viewed(avatar, run)
-            session = _session(viewed, motions)
+            viewed, clips = viewed or open_viewed(avatar, run), {}
+            if viewed.sequences or play is not None:
+                from mien.pipeline.view_motions import clip_of
+
+                clips = {name: clip_of(viewed, avatar, name, neutral) for name in viewed.sequences}
+                if play is not None:
+                    clips[Path(play).name] = clip_of(viewed, Path(play), None, neutral, capture)
+            session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
+            if play is not None and at_once:
+                session.choose(Path(play).name)
+                session.play(True, time.monotonic())
             if follow:
                 threading.Thread(target=follow_file, args=(session, avatar), daemon=True).start()
-            camera, name = _camera_switch(session, viewed, place), viewed.portable.about.name
-            serve(session, door, place.port, name, lambda address: None, camera, listener)
+            serve(session, door, listener, viewed.portable.about.name, _camera_switch(session, viewed, door))
         except KeyboardInterrupt:
             say("The viewer is closed")
         except Terminated as stop:
             # Nothing continues later. A training ends its viewer in this way, and says so itself.
             raise SystemExit(stop.code) from None
-
-
-def _session(viewed: Viewed, motions: Motions) -> Session:
-    """The avatar that browsers share, and the motions that it may play."""
-    clips = {}
-    if viewed.sequences or motions.play is not None:
-        from mien.pipeline.view_motions import clip_of
-
-        clips = {name: clip_of(viewed, folder, name, motions.neutral) for name, folder in viewed.sequences.items()}
-        if motions.play is not None:
-            clips[Path(motions.play).name] = clip_of(viewed, Path(motions.play), None, motions.neutral, motions.capture)
-    session = Session(runtime.Avatar(viewed.portable), viewed.mesh, clips)
-    if motions.play is not None and motions.at_once:
-        session.choose(Path(motions.play).name)
-        session.play(True, time.monotonic())
-    return session
 
 
 def open_viewed(avatar: Path, run: str | None) -> Viewed:
@@ -133,21 +113,21 @@ def viewed_file(path: Path) -> Viewed:
 
         return person_of(path, portable)
 
-    return Viewed(portable, mesh_of(portable), {}, person)
+    return Viewed(portable, mesh_of(portable), [], person)
 
 
-def _camera_switch(session: Session, viewed: Viewed, place: Place) -> CameraSwitch | None:
+def _camera_switch(session: Session, viewed: Viewed, door: Door) -> CameraSwitch | None:
     """The switch of this machine's first camera, if it has one and if what follows a face is installed.
 
     Other machines must not turn it on, nor other users of this one.
     """
-    if not devices() or not is_loopback(place.host) or not place.token or os.environ.get(PARENT_VARIABLE) is not None:
+    if not devices() or not is_loopback(door.host) or door.token is None or os.environ.get(PARENT_VARIABLE) is not None:
         return None
     try:
-        from mien.pipeline.view_motions import switch_of_first_camera
+        from mien.pipeline.view_motions import switch_of
     except ModuleNotFoundError:
         return None
-    return switch_of_first_camera(session, viewed)
+    return switch_of(session, viewed)
 
 
 def follow_file(session: Session, path: Path) -> None:

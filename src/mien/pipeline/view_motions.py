@@ -29,8 +29,8 @@ from mien.runtime.baked import PortableAvatar
 from mien.training.footage.filmed import read_coverage
 from mien.training.run import filmed_range, run_camera
 from mien.training.whole_head.soft_cut import with_soft_cut
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import Mesh
-from mien.viewer.following import CameraSwitch
 from mien.viewer.session import Clip, Session
 
 
@@ -46,8 +46,7 @@ def of_workspace(root: Path, run: str | None) -> Viewed:
     coverage = read_coverage(run_dir, model)
     if coverage is not None and len(coverage.seen) == len(mesh.faces):
         mesh = replace(mesh, seen=as_array(coverage.seen))
-    sequences = dict.fromkeys(workspace.tracked_names(), root)
-    return Viewed(portable, mesh, sequences, lambda: (model, avatar.subject))
+    return Viewed(portable, mesh, workspace.tracked_names(), lambda: (model, avatar.subject))
 
 
 def person_of(path: Path, portable: PortableAvatar) -> tuple[FaceModel, FaceParams]:
@@ -87,22 +86,25 @@ def clip_of(
     return load
 
 
-def switch_of_first_camera(session: Session, viewed: Viewed) -> CameraSwitch:
-    """Return a switch that lets the avatar of a session follow the first camera of this machine."""
-    return switch_of(session, viewed, camera_named("camera", None), FollowOptions())
-
-
 def switch_of(
-    session: Session, viewed: Viewed, name: CameraName, follow: FollowOptions, again: bool = True
+    session: Session,
+    viewed: Viewed,
+    name: CameraName | None = None,
+    follow: FollowOptions | None = None,
+    again: bool = True,
 ) -> CameraSwitch:
-    """Return a switch that lets the avatar of a session follow a camera. With `again`, a file plays again and again."""
+    """Return a switch that lets the avatar of a session follow a camera, by default the first of this machine.
+
+    With `again`, a file plays again and again.
+    """
+    camera = name or camera_named("camera", None)
 
     def make() -> Follower:
         model, person = viewed.person()
         eye = as_array(_position(viewed.portable.camera))
-        return Follower(model, person, viewed.portable.filmed, eye, follow)
+        return Follower(model, person, viewed.portable.filmed, eye, follow or FollowOptions())
 
-    return CameraSwitch(session, lambda: LiveCamera(name, again, say), make)
+    return CameraSwitch(session, lambda: LiveCamera(camera, again, say), make)
 
 
 def _position(camera: runtime.Camera) -> torch.Tensor:

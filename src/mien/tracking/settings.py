@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from mien.disk.config import COUNT, COUNT_OR_NONE, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges
+from mien.disk.config import COUNT, COUNT_OR_NONE, NOT_NEGATIVE, POSITIVE, Range, check_ranges
 from mien.errors import UserError
 
 _FOCALS = (10.0, 1e6)
@@ -45,19 +45,8 @@ class PhotometricSettings:
     """Gauss-Newton steps of identity and focal length before each iteration but the first."""
     keyframes: Annotated[int, COUNT] = 24
     """Timesteps of each sequence for these steps; fewer with several cameras, for at most twice this many pictures."""
-    focal_sigma: Annotated[float, POSITIVE] = 0.04
-    """Standard deviation of the logarithm of an unknown focal length from that of the fit to landmarks."""
     outline_weight: Annotated[float, NOT_NEGATIVE] = 10.0
     """Weight of the head's outline in a keyframe; 0 switches it off. Only a single camera needs it, for perspective."""
-    independent_pixels: Annotated[float, POSITIVE] = 100.0
-    """Number of independent pixels that all pixels of a picture are worth in the steps of identity and focal length,
-    because their errors are correlated. It weighs them against landmarks and priors."""
-    independent_pixels_of_frames: Annotated[float, POSITIVE] = 50.0
-    """The same for the steps of frames. If it is much larger, errors of texture, light and shape become expressions,
-    most of which follow the head's turns. If it is much smaller, only landmarks determine the shape."""
-    landmark_share: Annotated[float, FRACTION] = 0.3
-    """Weight of landmarks, as a share of their weight in the fit to landmarks alone. Those of lips, lids and irises
-    keep their full weight."""
     outlier: Annotated[float, POSITIVE] = 10.0
     """Number of standard deviations of its colour beyond which a pixel's pull fades. It is large, because faces that
     are off by some pixels make most pixels differ by several, and the fit learns from those."""
@@ -87,14 +76,6 @@ class PaperSettings:
     """Passes over all frames in random order that refine everything."""
     texture_size: Annotated[int, _TEXELS] = 512
     """Texels along each side of the texture."""
-    shrink: Annotated[int, Range(1, 64)] = 1
-    """Factor by which pictures are scaled down for the fit. 2 is four times as fast, and less exact."""
-    color_weight: Annotated[float, NOT_NEGATIVE] = 3e3
-    """Weight of the mean colour difference (0..1) to the rendering. A squared standard deviation counts 1."""
-    landmark_share: Annotated[float, FRACTION] = 0.3
-    """Weight of landmarks, as a share of their weight in the fit to landmarks alone."""
-    offset_sigma: Annotated[float, NOT_NEGATIVE] = 0.002
-    """Standard deviation of vertex offsets, in metres; 0 switches them off."""
 
 
 @dataclass(frozen=True)
@@ -112,13 +93,8 @@ class TrackingSettings:
     contour points. Irises always count, for the gaze."""
     keyframes: Annotated[int, COUNT] = 20
     """Frames of each sequence from which identity is fitted. They are chosen for different head poses."""
-    independent_landmarks: Annotated[float, POSITIVE] = 25.0
-    """Number of independent landmarks that all of a picture are worth, because their errors are correlated."""
     identity_weight: Annotated[float, NOT_NEGATIVE] = 4.0
     """Weight of the identity's unit-variance prior."""
-    bias_sigma: Annotated[float, POSITIVE] = 0.003
-    """Standard deviation of a landmark's offset on the subject from the model's, in metres. All sequences share the
-    offsets. It is used only for face models without a measured `mien.tracking.landmarks.DetectorResponse`."""
     smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
     """Smoothness over time."""
     schedule: Literal["landmarks", "fast", "paper"] = "fast"

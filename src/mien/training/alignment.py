@@ -43,6 +43,7 @@ _ALIGNED_JUDGED = 32  # number of training timesteps that say how large gradient
 _ALIGNED_MOMENTUM = 0.7  # share of the last steps' direction in the next one. Measured: the log, 11-27
 _ALIGNED_EXPRESSION = 10.0
 """Rate of expression coefficients, as a share of that of the head's rotation. Measured: the log, 11-27."""
+_ALIGNED_TURN = 7e-4  # how far a step turns a head whose gradient has the usual size, in radians
 _ALIGNED_JOINTS = 3.0  # rate of joint angles, as a share of that of the head's rotation. Measured: the log, 11-27
 _ALIGNED_SHIFT = 0.3
 """Rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with which training
@@ -154,7 +155,7 @@ def align_faces(
     corrections of head poses share. With a folder, a stopped call continues there.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
-    tuning, bounds = _tuning(settings, single), avatar.face_model.expression_bounds
+    tuning, bounds = _tuning(single), avatar.face_model.expression_bounds
     used = torch.cat(_trained(known, lengths)).nonzero()[:, 0].tolist()
     track = FaceTrack(concatenate(list(starts)), tuning, lengths, bounds, trained=used)
     targets = [Targets(sequence, settings.resolution, len(sequences), cleaned=True) for sequence in sequences]
@@ -216,9 +217,9 @@ def _values(track: FaceTrack, index: int) -> dict[str, Tensor]:
     return {f"{group.name}.{name}": tensor for group in groups for name, tensor in group.tensors.items()}
 
 
-def _tuning(settings: AlignmentSettings, single: bool) -> FaceTuning:
+def _tuning(single: bool) -> FaceTuning:
     rates = (_ALIGNED_EXPRESSION, _ALIGNED_JOINTS, 1.0, _ALIGNED_SHIFT)
-    own = [share * settings.rate for share in rates]
+    own = [share * _ALIGNED_TURN for share in rates]
     return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
 
 

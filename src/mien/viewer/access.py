@@ -12,7 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import SplitResult, parse_qsl, urlsplit
+
+from websockets.datastructures import Headers
+from websockets.http11 import Response
 
 from mien.errors import UserError
 from mien.machine.terminal import printable
@@ -50,15 +53,6 @@ def is_loopback(host: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """An answer of the door, instead of the viewer's."""
-
-    status: HTTPStatus
-    headers: Mapping[str, str]
-    body: str = ""
-
-
-@dataclass(frozen=True)
 class Door:
     """The rules of one viewer."""
 
@@ -74,15 +68,17 @@ class Door:
             raise UserError(f"--no-token: other machines can reach --host {host}; leave --no-token out")
         return Door(host, secrets.token_urlsafe(18) if with_token else None)
 
-    def answer(self, path: str, headers: Mapping[str, str]) -> Answer | None:
+    def answer(self, path: str, headers: Mapping[str, str]) -> Response | None:
         """None if a request may go on, or what to answer instead. `path` has the query, too."""
         given = {name.lower(): value for name, value in headers.items()}
         host = given.get("host", "")
         origin = given.get("origin")
-        if origin is not None and _place_of(origin) != host:
+        parts = None if origin is None else _parts_of(origin)
+        if origin is not None and (parts is None or parts.netloc != host):
             return _refusal(_STRANGE_ORIGIN.format(origin=_shown(origin), host=_shown(host)))
         if self.token is None:
-            known = _name_of(host) in (*LOOPBACK_NAMES, self.host)
+            parts = _parts_of(f"//{host}")
+            known = parts is not None and parts.hostname in (*LOOPBACK_NAMES, self.host)
             return None if known else _refusal(_STRANGE_HOST.format(host=_shown(host)))
         asked = dict(parse_qsl(path.partition("?")[2])).get("token")
         if asked is not None:
@@ -90,7 +86,7 @@ class Door:
                 return _refusal(_NO_TOKEN)
             # Without a path, the cookie is for the folder of the address, which may be a proxy's sub-path.
             cookie = f"{self.cookie}; HttpOnly; SameSite=Strict"
-            return Answer(HTTPStatus.SEE_OTHER, {"Location": _PAGE, "Set-Cookie": cookie})
+            return _response(HTTPStatus.SEE_OTHER, {"Location": _PAGE, "Set-Cookie": cookie})
         return None if _same(self._token_in(given.get("cookie", "")), self.token) else _refusal(_NO_TOKEN)
 
     def address(self, host: str, port: int) -> str:
@@ -101,39 +97,32 @@ class Door:
     @property
     def cookie(self) -> str:
         """The cookie of a browser that may use the viewer, NAME=VALUE."""
-        return f"{self._cookie_name}={self.token}"
-
-    @property
-    def _cookie_name(self) -> str:
         # Cookies are the same for all ports of a host, so each viewer has its own name.
-        return f"mien_{self.token[:6] if self.token else ''}"
+        return f"mien_{self.token[:6] if self.token else ''}={self.token}"
 
     def _token_in(self, cookies: str) -> str:
         try:
-            found = SimpleCookie(cookies).get(self._cookie_name)
+            found = SimpleCookie(cookies).get(self.cookie.partition("=")[0])
         except CookieError:
             return ""
         return found.value if found is not None else ""
 
 
-def _refusal(words: str) -> Answer:
-    return Answer(HTTPStatus.FORBIDDEN, {"Content-Type": "text/plain; charset=utf-8"}, words)
+def _refusal(words: str) -> Response:
+    return _response(HTTPStatus.FORBIDDEN, {"Content-Type": "text/plain; charset=utf-8"}, words)
 
 
-def _place_of(origin: str) -> str | None:
-    """The host and port in an Origin header. None if it is no address."""
+def _response(status: HTTPStatus, headers: Mapping[str, str], words: str = "") -> Response:
+    body = words.encode()
+    return Response(status.value, status.phrase, Headers({**headers, "Content-Length": str(len(body))}), body)
+
+
+def _parts_of(address: str) -> SplitResult | None:
+    """The parts of an address, or None if it is none."""
     try:
-        return urlsplit(origin).netloc
+        return urlsplit(address)
     except ValueError:
         return None
-
-
-def _name_of(host: str) -> str:
-    """The name in a Host header, without its port."""
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
 
 
 def _shown(header: str) -> str:

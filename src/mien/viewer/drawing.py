@@ -130,8 +130,7 @@ def _with_edges(picture: UInt8[np.ndarray, "h w 3"], index: Int32[np.ndarray, "h
     edge[:, 1:] |= index[:, 1:] != index[:, :-1]
     edge[1:] |= index[1:] != index[:-1]
     lined = picture.copy()
-    line = np.array([40, 90, 220], np.float32)
-    lined[edge] = (0.6 * line + (1 - 0.6) * picture[edge]).astype(np.uint8)
+    lined[edge] = (0.6 * np.array([40, 90, 220], np.float32) + (1 - 0.6) * picture[edge]).astype(np.uint8)
     return lined
 
 
@@ -139,43 +138,36 @@ def beside(
     filmed: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"], background: str
 ) -> UInt8[np.ndarray, "h _ 3"]:
     """A filmed frame in the left half, as large as fits, and the avatar in the right half."""
-    import cv2
-
     height, width = shown.shape[:2]
-    scale = height / filmed.shape[0] * shrunk(filmed, width, height)
-    size = (max(1, round(filmed.shape[1] * scale)), max(1, round(filmed.shape[0] * scale)))
-    color = [round(255 * part) for part in BACKGROUNDS[background]]
-    left = np.full((height, width, 3), color, np.uint8)
-    top, start = (height - size[1]) // 2, (width - size[0]) // 2
-    fitted = cv2.resize(filmed, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    left[top : top + size[1], start : start + size[0]] = fitted
+    fitted = _resized(filmed, height / filmed.shape[0] * shrunk(filmed.shape[1], filmed.shape[0], width, height))
+    high, wide = fitted.shape[:2]
+    left = np.full((height, width, 3), [round(255 * part) for part in BACKGROUNDS[background]], np.uint8)
+    top, start = (height - high) // 2, (width - wide) // 2
+    left[top : top + high, start : start + wide] = fitted
     return np.concatenate([left, shown], axis=1)
 
 
-def fitted(camera: runtime.Camera, width: int, height: int) -> float:
-    """How much smaller the avatar is drawn in a narrow window than in one of its height and any width, at most 1.
+def shrunk(filmed_width: int, filmed_height: int, width: int, height: int) -> float:
+    """How much smaller what was filmed is that fits a picture than one that only has the picture's height, at most 1.
 
-    What the filmed camera shows then fits the width, as on a phone that is held upright.
+    The avatar is drawn as much smaller: then it fits a phone that is held upright, and beside a filmed frame both heads
+    have one size.
     """
-    return min(1.0, width * camera.height / (camera.width * height))
+    return min(1.0, width * filmed_height / (filmed_width * height))
 
 
-def shrunk(filmed: UInt8[np.ndarray, "h w 3"], width: int, height: int) -> float:
-    """How much smaller a filmed frame is that fits a half of the picture than one of the half's height, at most 1.
+def _resized(picture: UInt8[np.ndarray, "_ _ 3"], scale: float) -> UInt8[np.ndarray, "_ _ 3"]:
+    import cv2
 
-    The avatar in the other half is drawn as much smaller, so that both heads have one size.
-    """
-    return min(1.0, width * filmed.shape[0] / (filmed.shape[1] * height))
+    size = max(1, round(scale * picture.shape[1])), max(1, round(scale * picture.shape[0]))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
 
 
 def in_corner(seen: UInt8[np.ndarray, "_ _ 3"], shown: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with what the camera saw in its lower left corner."""
-    import cv2
-
     height, width = shown.shape[:2]
-    scale = min(0.25 * height / seen.shape[0], 0.25 * width / seen.shape[1])
-    wide, high = (max(1, round(scale * side)) for side in (seen.shape[1], seen.shape[0]))
-    small = cv2.resize(seen, (wide, high), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    small = _resized(seen, min(0.25 * height / seen.shape[0], 0.25 * width / seen.shape[1]))
+    high, wide = small.shape[:2]
     bottom, left = height - round(0.02 * height), min(round(0.02 * height), width - wide)
     picture = shown.copy()
     picture[bottom - high : bottom, left : left + wide] = small

@@ -15,10 +15,8 @@ from mien.runtime.rotation import matrix_from_axis_angle
 from mien.viewer.drawing import MAX_SIDE, View
 from mien.viewer.session import Session
 
-TURNTABLE_FRAMES, TURNTABLE_FPS = 100, 25.0
-"""Number of frames and frames a second of a turntable, which is the video of a session without a motion."""
-
-
+TURNTABLE_FRAMES = 100
+"""Number of frames of a turntable, which is the video of a session without a motion."""
 SCREENSHOT_HEIGHT = 1080
 """Smallest height of a screenshot in pixels."""
 
@@ -54,14 +52,13 @@ def video(
             if not go_on():
                 raise Stopped
             if clip is None:
-                turned = around(view, center, 2 * math.pi * index / TURNTABLE_FRAMES)
-                yield session.picture(turned)
+                yield session.picture(around(view, center, 2 * math.pi * index / TURNTABLE_FRAMES))
             else:
                 yield session.picture(view, timestep=index)
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
-        write_pictures(Output(path, "mp4", False), pictures(), TURNTABLE_FPS if clip is None else clip.motion.fps)
+        write_pictures(Output(path, "mp4", False), pictures(), 25.0 if clip is None else clip.motion.fps)
         return path.read_bytes()
 
 

@@ -1,11 +1,12 @@
 """The loop that draws for all browsers: the newest request wins, half size while anything moves, full size when still.
 
-It knows neither the avatar nor the browser. It calls `draw`, and hands what that returns to `show` of one client.
+It knows neither the avatar nor the browser. It calls `draw`, and hands what that returns to `show` of one client. Slow
+work of the controls has threads of its own.
 """
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,12 +46,9 @@ class DrawingLoop:
     ) -> None:
         """Make a loop that is not running yet.
 
-        Args:
-            draw: Returns the picture of a view, of half size or full size.
-            advance: Is called before each picture with the time. It changes what plays, and returns when it wants to be
-                called again, or None.
-            clock: Returns the time in seconds.
-            failed: Is called if a picture of one client cannot be drawn or shown; it gets none until something changes.
+        `draw` returns the picture of a view, of half size or full size. `advance` is called before each picture with
+        the time: it changes what plays, and returns when it wants to be called again, or None. `failed` is called if a
+        picture of one client cannot be drawn or shown; it gets none until something changes.
         """
         self._draw, self._advance, self._clock, self._failed = draw, advance, clock, failed
         self._clients: dict[int, _Client] = {}
@@ -59,8 +57,6 @@ class DrawingLoop:
         self._thread: threading.Thread | None = None
         self._full_seconds: float | None = None
         self._is_quick = False
-        self.pictures = 0
-        """Number of pictures so far."""
         self.error: BaseException | None = None
         """What ended the loop, if it was not `stop`: a failure that concerns all clients."""
 
@@ -120,7 +116,6 @@ class DrawingLoop:
         with self._changed:
             self._time((ended - began) * (1.0 if full else 4.0))  # it has four times the pixels
             client.drawn, client.is_full, client.served_at = wanted, full, ended
-            self.pictures += 1
             there = self._clients.get(key) is client
         if there:
             client.show(picture, full)
@@ -132,13 +127,8 @@ class DrawingLoop:
         if waiting:
             key, client = min(waiting, key=lambda item: item[1].served_at)
             return key, client, self._is_quick or now - client.changed_at >= STILL_SECONDS
-        still = [
-            (key, client) for key, client in seen if not client.is_full and now - client.changed_at >= STILL_SECONDS
-        ]
-        if not still:
-            return None
-        key, client = min(still, key=lambda item: item[1].served_at)
-        return key, client, True
+        still = [item for item in seen if not item[1].is_full and now - item[1].changed_at >= STILL_SECONDS]
+        return (*min(still, key=lambda item: item[1].served_at), True) if still else None
 
     def _time(self, seconds: float) -> None:
         """Take account of the time that a full picture took, or would have taken."""
@@ -188,3 +178,54 @@ class DrawingLoop:
                         self._changed.wait(seconds)
         except BaseException as error:  # noqa: BLE001
             self.error = error
+
+
+class Worker:
+    """Does slow work of the controls, one thing at a time: pictures and videos to save, motions to load, the camera.
+
+    viser would run it in a queue without a bound, which the process has to empty before it can end.
+    """
+
+    def __init__(self, name: str, failed: Callable[[Exception], None], most: int = 1) -> None:
+        """Make a worker. `failed` takes an exception of the work, after which it goes on; `most` works may wait."""
+        self._name, self._failed, self._most = name, failed, most
+        self._changed = threading.Condition()
+        self._waiting: dict[Hashable, Callable[[], None]] = {}
+        self._busy = self._stopping = False
+        self._thread: threading.Thread | None = None
+
+    def ask(self, key: Hashable, work: Callable[[], None]) -> bool:
+        """Do some work soon, in place of work with the same key that still waits. False if too much waits already."""
+        with self._changed:
+            full = len(self._waiting) >= self._most and (self._busy or bool(self._waiting))
+            if self._stopping or (full and key not in self._waiting):
+                return False
+            self._waiting[key] = work
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread.start()
+            self._changed.notify()
+        return True
+
+    def stop(self) -> None:
+        """Drop what waits, and wait a moment for what runs."""
+        with self._changed:
+            self._stopping = True
+            self._waiting.clear()
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(2.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.wait_for(lambda: bool(self._waiting) or self._stopping)
+                if self._stopping:
+                    return
+                work = self._waiting.pop(next(iter(self._waiting)))
+                self._busy = True
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001
+                self._failed(error)

@@ -12,12 +12,12 @@ import viser
 from mien import runtime
 from mien.errors import UserError
 from mien.machine.terminal import printable
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import BACKGROUNDS, Surface, View
 from mien.viewer.faces import grouped, matches, readable
 from mien.viewer.files import Stopped, screenshot, video
-from mien.viewer.following import CameraSwitch
+from mien.viewer.loop import Worker
 from mien.viewer.session import Session, center_of
-from mien.viewer.work import Worker
 
 MAX_ANGLE = 0.5
 """Largest angle of a joint's slider, in radians."""
@@ -39,13 +39,8 @@ class Panel:
     ) -> None:
         """Add the controls to a server.
 
-        Args:
-            server: The server.
-            session: What the controls change.
-            title: Name of the avatar, for people and for the files that are saved.
-            view_of: Returns the view of a client's camera.
-            failed: Is called with an exception of slow work.
-            camera: What lets the avatar follow a camera, if there is one.
+        `title` names the avatar, for people and for the files that are saved; `view_of` returns the view of a client's
+        camera; `failed` takes an exception of slow work.
         """
         self._server, self._session, self._view_of = server, session, view_of
         self._title = printable(Path(title).name) or "avatar"
@@ -89,7 +84,7 @@ class Panel:
         self._followed_at = now
         self._name_play()
         if self._report is not None and self._camera is not None:
-            self._report.content = _plain_lines(self._camera.report())
+            self._report.content = "  \n".join(map(_plain, self._camera.report()))
         if self._time is not None:
             self._time.value = self._session.timestep
 
@@ -157,19 +152,17 @@ class Panel:
             timeline = self._time = gui.add_slider("Frame", 0, last, 1, 0)
             filmed = gui.add_checkbox("Filmed frame beside it", False)
         self.play_button = play
-        before = [first]
 
         def choose(name: str, client: viser.ClientHandle | None) -> None:
             try:
-                if name != before[0]:
+                if name != (session.chosen or _NOTHING):
                     session.choose(None if name == _NOTHING else name)
-                before[0] = name
                 if self._play_asked and session.clip is not None:
                     session.play(True, time.monotonic())
                 timeline.max = max(1, len(session.clip.motion) - 1) if session.clip else 1
             except (UserError, ImportError) as error:
                 if chosen.value == name:
-                    chosen.value = before[0]
+                    chosen.value = session.chosen or _NOTHING
                 if isinstance(error, ImportError):
                     raise
                 self._complain(client, str(error))
@@ -179,7 +172,7 @@ class Panel:
 
         def load(client: viser.ClientHandle | None) -> None:
             name = chosen.value
-            self._loading = name not in (_NOTHING, before[0])
+            self._loading = name not in (_NOTHING, session.chosen)
             self._name_play()
             self._motions.ask("motion", lambda: choose(name, client))
 
@@ -380,7 +373,3 @@ def _rounded(value: float, low: float, high: float) -> float:
 def _plain(text: str) -> str:
     """A text without characters that Markdown or HTML would read."""
     return "".join(character if character.isalnum() or character in " -._" else " " for character in printable(text))
-
-
-def _plain_lines(lines: list[str]) -> str:
-    return "  \n".join(_plain(line) for line in lines)

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import gzip
 import http.client
 import io
 import logging
@@ -24,37 +25,43 @@ from mien.errors import UserError
 from mien.machine.terminal import tell
 from mien.plugins import missing_package
 from mien.viewer.access import HEADERS, Door
+from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import View
-from mien.viewer.following import CameraSwitch
 from mien.viewer.loop import DrawingLoop
-from mien.viewer.page import adapted
 from mien.viewer.panel import Panel, filmed_from
 from mien.viewer.session import Session, center_of
 
+_SCRIPT = """<script>
+// mien draws the pictures, not the browser: without these words viser does not ask whether the browser has a GPU.
+for (const kind of [self.WebGLRenderingContext, self.WebGL2RenderingContext]) {
+  if (!kind) continue;
+  const get = kind.prototype.getExtension;
+  kind.prototype.getExtension = function (name) {
+    return name === "WEBGL_debug_renderer_info" ? null : get.call(this, name);
+  };
+}
+// On phones, viser's panel lies over the avatar: it begins folded, and a touch of its title unfolds it. How wide the
+// window is shows only after this script, because the words on the viewport come later in the page.
+new MutationObserver((changes, watch) => {
+  const isTitle = ({ style }) => style.height === "3.5em" && style.cursor === "pointer";
+  const title = [...document.querySelectorAll("div")].find(isTitle);
+  if (!title) return;
+  watch.disconnect();
+  if (matchMedia("(max-width: 36em)").matches) title.click();
+}).observe(document, { childList: true, subtree: true });
+</script>"""
+"""What mien adds to viser's page: no warning of a missing GPU, and a folded panel on phones."""
+
 
 def serve(
-    session: Session,
-    door: Door,
-    port: int,
-    title: str,
-    ready: Callable[[str], None],
-    camera: CameraSwitch | None = None,
-    listener: socket.socket | None = None,
+    session: Session, door: Door, listener: socket.socket, title: str, camera: CameraSwitch | None = None
 ) -> None:
     """Show a session to browsers until Ctrl-C or SIGTERM, or until its camera ends.
 
-    Args:
-        session: The session.
-        door: Who may use it, and the host to listen on.
-        port: The port, or 0 for a free one.
-        title: Name of the avatar.
-        ready: Is called with the address, as soon as browsers can open it.
-        camera: What lets the avatar follow a camera, if there is one.
-        listener: What `listen` returned for the host and the port, if browsers may wait there already.
+    `door` says who may use it. Browsers may wait already at the listener, which `listen` returned.
     """
-    serving = Serving(session, door, port, title, camera, listener)
+    serving = Serving(session, door, listener, title, camera)
     try:
-        ready(serving.address)
         serving.wait()
     finally:
         serving.stop()
@@ -64,24 +71,18 @@ class Serving:
     """A server that runs."""
 
     def __init__(
-        self,
-        session: Session,
-        door: Door,
-        port: int,
-        title: str,
-        camera: CameraSwitch | None = None,
-        listener: socket.socket | None = None,
+        self, session: Session, door: Door, listener: socket.socket, title: str, camera: CameraSwitch | None = None
     ) -> None:
         """Start the server; the arguments are those of `serve`."""
         self.session, self.door, self._camera = session, door, camera
         self.failures: list[str] = []
         """The first failures of requests of browsers. The viewer goes on."""
         self._failing = threading.Lock()
-        listener = listener or listen(door.host, port)
         self.port = int(listener.getsockname()[1])
         # A client that vanishes in the middle of a request is no error of the viewer.
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
-        with _quiet(), _guarded(door, listener):
+        # viser prints on standard output.
+        with contextlib.redirect_stdout(io.StringIO()), _guarded(door, listener):
             self.server = viser.ViserServer(host=door.host, port=self.port, label="mien", verbose=False)
         try:
             _check_guard(door.host, self.port)
@@ -90,7 +91,7 @@ class Serving:
             self.server.get_event_loop().set_exception_handler(self._task_failed)
             self._show(title)
         except BaseException:
-            with _quiet():
+            with contextlib.redirect_stdout(io.StringIO()):
                 self.server.stop()
             raise
         self.address = address_of(door, listener)
@@ -108,7 +109,7 @@ class Serving:
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         self.panel.stop()
         self.loop.stop()
-        with _quiet():
+        with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def _show(self, title: str) -> None:
@@ -204,7 +205,9 @@ def listen(host: str, port: int) -> socket.socket:
     except (OSError, UnicodeError) as error:
         number = getattr(error, "errno", None)
         if number == errno.EADDRINUSE:
-            raise _taken(port) from None
+            raise UserError(
+                f"--port {port}: another program uses it; give another port, or leave --port out for a free one"
+            ) from None
         if number == errno.EACCES:
             raise UserError(f"--port {port}: is not allowed for this user; give one above 1023") from None
         raise UserError(
@@ -216,17 +219,6 @@ def address_of(door: Door, listener: socket.socket) -> str:
     """The address that people open to reach a socket."""
     host = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
     return door.address(host, int(listener.getsockname()[1]))
-
-
-def _taken(port: int) -> UserError:
-    return UserError(f"--port {port}: another program uses it; give another port, or leave --port out for a free one")
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Drop what viser prints on standard output."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
 
 
 @contextlib.contextmanager
@@ -243,10 +235,10 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
         **named: Any,
     ) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
-            response = _refused(door, request)
+            response = door.answer(request.path, dict(request.headers.raw_items()))
             if response is None:
                 given = process_request(connection, request)
-                response = None if given is None else adapted(given)
+                response = None if given is None else _adapted(given)
             if response is not None:
                 response.headers.update(HEADERS)
             return response
@@ -261,14 +253,18 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
         module.serve = start
 
 
-def _refused(door: Door, request: Request) -> Response | None:
-    """What the door answers to a request, or None if it may go on."""
-    answer = door.answer(request.path, dict(request.headers.raw_items()))
-    if answer is None:
-        return None
-    body = answer.body.encode()
-    headers = Headers({**answer.headers, "Content-Length": str(len(body))})
-    return Response(answer.status.value, answer.status.phrase, headers, body)
+def _adapted(response: Response) -> Response:
+    """The answer with mien's script, if it is viser's page. Any other answer stays as it is."""
+    if not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(response.body) if packed else response.body
+    body = body.replace(b"<head>", b"<head>" + _SCRIPT.encode(), 1)
+    body = gzip.compress(body) if packed else body
+    headers = Headers(response.headers.raw_items())
+    del headers["Content-Length"]
+    headers["Content-Length"] = str(len(body))
+    return Response(response.status_code, response.reason_phrase, headers, body)
 
 
 def _check_guard(host: str, port: int) -> None:

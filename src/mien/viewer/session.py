@@ -1,6 +1,6 @@
 """What all browsers of a viewer share: the face, the motion that plays, and what is drawn.
 
-Methods may be called from any thread. A `version` counts the changes.
+Methods may be called from any thread.
 """
 
 import math
@@ -25,7 +25,6 @@ from mien.viewer.drawing import (
     View,
     beside,
     draw,
-    fitted,
     in_corner,
     shrunk,
     words_about_view,
@@ -69,7 +68,6 @@ class Session:
         self._lock, self._drawing = threading.RLock(), threading.Lock()
         self.face = avatar.face()
         self._posed: tuple[Face, runtime.Gaussians] | None = None
-        self.version = 0
         self.clip_names = list(self._makers)
         """Names of the motions that can be chosen."""
         self.clip: Clip | None = None
@@ -100,7 +98,7 @@ class Session:
         """Show another state of the same person's avatar. The face stays."""
         with self._lock:
             self.avatar, self._posed = avatar, None
-            self._change()
+            self.changed()
 
     def set_expression(self, name: str, value: float) -> None:
         """Set one expression, within the bounds of the face model. What plays is paused."""
@@ -132,7 +130,7 @@ class Session:
         with self._lock:
             self.preset = preset
             self.face = self._face_at(self.timestep)
-            self._change()
+            self.changed()
 
     def take_random(self, random: np.random.Generator) -> None:
         """Show a random face, softly within what was filmed if that is known."""
@@ -173,7 +171,7 @@ class Session:
             else:
                 self.face = self._face_at(self.timestep)
                 self._playing_since = now - self.timestep / self.clip.motion.fps
-            self._change()
+            self.changed()
 
     def advance(self, now: float) -> float | None:
         """Go on to the timestep of this moment. Return the time at which the next one is due, or None if none plays."""
@@ -186,7 +184,7 @@ class Session:
             timestep = steps % len(motion)
             if timestep != self.timestep:
                 self.timestep, self.face = timestep, self._face_at(timestep)
-                self._change()
+                self.changed()
             return self._playing_since + (steps + 1) / motion.fps
 
     def follow(self, face: Face, seen: Seen) -> None:
@@ -214,18 +212,15 @@ class Session:
             self.side_by_side = bool(changes.pop("side_by_side", self.side_by_side))
             self.with_camera = bool(changes.pop("with_camera", self.with_camera))
             self.look = replace(self.look, **changes)
-            self._change()
+            self.changed()
 
     def picture(
         self, view: View, full: bool = True, height: int | None = None, timestep: int | None = None
     ) -> UInt8[np.ndarray, "h w 3"]:
         """The picture of a view, of full size or half of it.
 
-        Args:
-            view: The view.
-            full: Whether the picture has its full size.
-            height: Largest height of a full picture in pixels (default: that of the session).
-            timestep: Timestep of the motion to draw (default: the face that is shown).
+        `height` is the largest height of a full picture in pixels (default: that of the session), and `timestep` one of
+        the motion (default: the face that is shown).
         """
         with self._lock:
             face, look, clip, seen = self.face, self.look, self.clip, self._seen
@@ -241,11 +236,11 @@ class Session:
         filmed = clip.pictures if clip is not None and side_by_side else None
         with self._drawing:
             frame = None if filmed is None else filmed(timestep)
-            half = max(1, wide // 2)
             if frame is None:
-                camera = view.camera(wide, high, fitted(self.avatar.camera, wide, high))
+                source = self.avatar.camera.width, self.avatar.camera.height
             else:
-                camera = view.camera(half, high, shrunk(frame, half, high))
+                source, wide = (frame.shape[1], frame.shape[0]), max(1, wide // 2)
+            camera = view.camera(wide, high, shrunk(*source, wide, high))
             shown = draw(self._gaussians(face), face, self.mesh, look, camera)
             picture = shown if frame is None else beside(frame, shown, look.background)
             if seen is not self._last_seen:
@@ -265,7 +260,7 @@ class Session:
     def _take(self, face: Face) -> None:
         with self._lock:
             self._playing_since, self.preset, self.face = None, None, face
-            self._change()
+            self.changed()
 
     def _face_at(self, timestep: int) -> Face:
         """The face of the motion at a timestep, or the person at rest, with the preset face added."""
@@ -278,10 +273,6 @@ class Session:
         low, high = avatar.portable.expression_bounds.T
         expression = np.clip(face.expression + posed.expression - rest.expression, low, high)
         return replace(face, expression=expression, joints=face.joints + posed.joints - rest.joints)
-
-    def _change(self) -> None:
-        self.version += 1
-        self.changed()
 
 
 def _check_finite(name: str, value: float) -> None:

@@ -167,8 +167,7 @@ class Descent:
         """Gradients of one timestep's cost by all parameters that it depends on and that move."""
         names = ["row"]
         if not self.fixed_person:
-            names += ["identity", "texture", "light"]
-            names += ["offsets"] if self.scene.settings.offset_sigma > 0 else []
+            names += ["identity", "texture", "light", "offsets"]
             names += ["log_focals"] if len(self.state.log_focals) else []
         targets = self.targets(*place)
         with torch.enable_grad():

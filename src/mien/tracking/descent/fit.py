@@ -104,8 +104,7 @@ def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: Phot
         # The effect of the offsets on landmarks is added to the bias.
         marks = scene.face_model.landmarks["mediapipe"]
         bias = fit.subject.bias + marks.positions(state.offsets, scene.mesh.faces).double()
-    offsets = state.offsets if scene.settings.offset_sigma > 0 else None
-    subject = replace(fit.subject, identity=state.identity.double(), bias=bias, vertex_offsets=offsets)
+    subject = replace(fit.subject, identity=state.identity.double(), bias=bias, vertex_offsets=state.offsets)
     sequences = []
     for own, was, rows in zip(scene.sequences, fit.sequences, state.frames, strict=True):
         factor = 1.0 if own.lens is None else float(state.log_focals[own.lens].exp())

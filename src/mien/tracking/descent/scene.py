@@ -131,12 +131,12 @@ def paper_scene(problem: Problem, fit: Fit, refined: PhotometricFit | None = Non
 
 
 def _sequences(problem: Problem, fit: Fit) -> tuple[SequenceScene, ...]:
-    settings, scenes = problem.settings.paper, []
+    scenes = []
     costs = zip(problem.landmark_terms(fit), problem.smoothness(fit), strict=True)
     for (data, sequence), lens, (term, smoothness) in zip(problem.pairs(fit), problem.lenses, costs, strict=True):
-        cameras, term = sequence.cameras, quiet_landmarks(term, settings.landmark_share)
+        cameras, term = sequence.cameras, quiet_landmarks(term)
         scenes.append(SequenceScene(
-            data.timesteps, Pictures(data.capture, settings.shrink),
+            data.timesteps, Pictures(data.capture, 1),
             CameraBatch(cameras.K.float(), cameras.viewmat.float()),
             Smoothness(smoothness.precision.float(), smoothness.linked), lens,
             tuple(term.at(torch.tensor([row])) for row in range(len(sequence.state))),

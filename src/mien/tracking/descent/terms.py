@@ -23,6 +23,7 @@ from mien.tracking.pixels.texture import LIGHT_EXTENT
 
 COLOR_EPSILON = 0.02  # colour difference below which the pull fades
 
+_COLOR_WEIGHT = 3e3  # of the mean colour difference (0..1) to the rendering; a squared standard deviation counts 1
 _GAPS = (*RIGHT_LID_PAIRS, *LEFT_LID_PAIRS, (13, 14), (82, 87), (312, 317), (81, 178), (311, 402))
 """Pairs of upper and lower landmarks. Their distances show how far eyes and mouth are open."""
 
@@ -86,7 +87,7 @@ def color_term(
     """
     camera, fragments = _rasterize(scene, target, moving, vertices)
     shape = fragments, image_points(camera, vertices), vertex_normals(vertices.detach(), scene.mesh.faces)
-    return scene.settings.color_weight * mesh_loss(*shape, *_appearance(scene, target, moving, weights))
+    return _COLOR_WEIGHT * mesh_loss(*shape, *_appearance(scene, target, moving, weights))
 
 
 def _appearance(
@@ -181,11 +182,9 @@ def light_term(light: Float[Tensor, "9 3"]) -> Float[Tensor, ""]:
 
 def offset_term(scene: PaperScene, offsets: Float[Tensor, "v 3"]) -> Float[Tensor, ""]:
     """Cost that keeps vertex offsets small and smooth (uniform Laplacian). About 100 vertices count as one."""
-    if scene.settings.offset_sigma == 0:
-        return offsets.new_zeros(())
     first, second, share = scene.neighbors
     mean = torch.zeros_like(offsets).index_add(0, first, offsets[second]) * share
-    small = (offsets / scene.settings.offset_sigma).square().sum()
+    small = (offsets / 0.002).square().sum()
     smooth = ((offsets - mean) / 0.0001).square().sum()  # a tenth of a millimetre from the mean of the neighbours
     return (small + smooth) / 100
 

@@ -60,7 +60,12 @@ class DetectorResponse:
         return replace(self, by_turn=torch.zeros_like(self.by_turn))
 
 
-def unknown_response(landmarks: int, expressions: int, sigma: float) -> DetectorResponse:
+OFFSET_SIGMA = 0.003
+"""Standard deviation of a landmark's offset on the subject from the model's, in metres, for face models without a
+measured response."""
+
+
+def unknown_response(landmarks: int, expressions: int, sigma: float = OFFSET_SIGMA) -> DetectorResponse:
     """A response of zeros: only the standard deviation `sigma` of the offsets is known."""
     zeros = torch.zeros(landmarks, 3, dtype=torch.float64)
     return DetectorResponse(

@@ -12,7 +12,6 @@ from mien.rotation import left_jacobian, matrix_from_axis_angle
 from mien.tracking.fitting.parameters import ParameterLayout, joint_derivatives
 from mien.tracking.fitting.views import CameraBatch
 from mien.tracking.landmarks.detector_response import DetectorResponse, unknown_response
-from mien.tracking.settings import TrackingSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +168,7 @@ def reduce_face_model(
         return torch.einsum("...lnc,lnk->...klc", positions[..., corners, :], share)
 
     joint_weights = share.sum(1).T.contiguous()
-    response = response or unknown_response(len(marks.faces), len(model.expression_basis), TrackingSettings.bias_sigma)
+    response = response or unknown_response(len(marks.faces), len(model.expression_basis))
     seen = torch.einsum("elc,kl->eklc", response.by_expression, joint_weights)
     return LandmarkModel(
         face_model=model,

@@ -27,7 +27,6 @@ from mien.tracking.landmarks.model import LandmarkModel
 from mien.tracking.landmarks.problem import Problem
 from mien.tracking.landmarks.shared_fit import fit_bias, fit_shared
 from mien.tracking.landmarks.term import LandmarkTerm, all_landmarks, landmark_term, unknown_subject
-from mien.tracking.settings import TrackingSettings
 
 FIRST_OUTLIER = 40.0  # outlier threshold of the first head pose, in standard deviations
 _SEQUENCE_ROUNDS = 2  # times that the fit over time alternates with the fit of the landmarks' bias
@@ -64,7 +63,7 @@ def _identify(problem: Problem, progress: Progress) -> Fit:
     model, settings = problem.model, problem.settings
     subject, starts = unknown_subject(model), []
     for data in problem.data:
-        pose = fit_head_pose(model, data.views, data.cameras, subject, settings)
+        pose = fit_head_pose(model, data.views, data.cameras, subject)
         starts.append(SequenceFit(data.cameras, widen(pose, model.layout)))
         _advance(progress, "head pose", 1, len(pose))
     start = Fit(subject, tuple(starts))
@@ -85,7 +84,7 @@ def _fit_motion(
     """Fit every timestep alone, then all timesteps of each sequence together."""
     model, settings, terms, sequences = problem.model, problem.settings, [], []
     for number, (data, batch) in enumerate(zip(problem.data, cameras, strict=True)):
-        pose = fit_head_pose(model, data.views, batch, subject, settings)
+        pose = fit_head_pose(model, data.views, batch, subject)
         start = SequenceFit(batch, widen(pose, model.layout))
         terms.append(all_landmarks(model, data.views, start, settings))
         sequences.append(_fit_frames(problem, terms[-1], subject, start, f"frames-{number}", progress))
@@ -154,9 +153,7 @@ def _fit_chain(
     return replace(start, state=state)
 
 
-def fit_head_pose(
-    model: LandmarkModel, views: Views, cameras: CameraBatch, subject: Subject, settings: TrackingSettings
-) -> Float[Tensor, "v 6"]:
+def fit_head_pose(model: LandmarkModel, views: Views, cameras: CameraBatch, subject: Subject) -> Float[Tensor, "v 6"]:
     """Fit head rotation and translation at each timestep alone, from landmarks that expressions hardly move.
 
     Each picture is fitted by itself first, starting from a head that faces its camera. If several cameras see a
@@ -171,7 +168,7 @@ def fit_head_pose(
     points = model.head_points(at_rest, subject.bias)[0][0]
 
     def fit_term(views: Views, state: Float[Tensor, "v 6"]) -> LandmarkTerm:
-        return replace(landmark_term(model, views, weights, state, cameras, settings), outlier=FIRST_OUTLIER)
+        return replace(landmark_term(model, views, weights, state, cameras), outlier=FIRST_OUTLIER)
 
     def minimize(term: LandmarkTerm, start: Float[Tensor, "v 6"]) -> Float[Tensor, "v 6"]:
         return minimize_frames(

@@ -18,6 +18,8 @@ from mien.tracking.settings import TrackingSettings
 
 LANDMARK_SIGMA = 0.0015  # expected error of a landmark, in metres on the face
 _OUTLIER = 6.0  # number of these sigmas beyond which a landmark's pull fades
+INDEPENDENT_LANDMARKS = 25.0
+"""Number of independent landmarks that all of a picture are worth, because their errors are correlated."""
 _SIDEWAYS_ANGLE = 0.3
 """Angle between the direction of the face and the camera at which a picture counts half if there are several cameras,
 in radians. Measured: 0.25 to 0.7 have the same error to 0.04 mm, and smaller angles better blinks (log, "Several
@@ -183,7 +185,6 @@ def landmark_term(
     weights: Float[Tensor, " l"],
     state: Float[Tensor, "v p"],
     cameras: CameraBatch,
-    settings: TrackingSettings,
 ) -> LandmarkTerm:
     """The landmark cost, with the expected error turned from metres into pixels at the median depth in each camera."""
     towards, origin = cameras.viewmat[:, 2, :3], cameras.viewmat[:, 2, 3]
@@ -192,19 +193,19 @@ def landmark_term(
     for camera in views.camera.unique():
         middle = depth[views.camera == camera].median()
         sigma[camera] = LANDMARK_SIGMA * cameras.K[camera, 0, 0] / middle
-    weights = weights * (settings.independent_landmarks / weights.sum())
+    weights = weights * (INDEPENDENT_LANDMARKS / weights.sum())
     return LandmarkTerm(model, views, weights, sigma, _OUTLIER)
 
 
 def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
     """The cost of all landmarks at the depth of a fit. Its head poses determine the trust in each picture."""
     views = replace(views, trust=trust_of(views, own.state, own.cameras))
-    return landmark_term(model, views, landmark_weights(settings.landmarks), own.state, own.cameras, settings)
+    return landmark_term(model, views, landmark_weights(settings.landmarks), own.state, own.cameras)
 
 
-def quiet_landmarks(term: LandmarkTerm, share: float) -> LandmarkTerm:
-    """The term with a share of its weight, but all of it for lips, lids and irises: no texture shows two mouths."""
-    kept = torch.full_like(term.weights, share)
+def quiet_landmarks(term: LandmarkTerm) -> LandmarkTerm:
+    """The term with 0.3 of its weight, but all of it for lips, lids and irises: no texture shows two mouths."""
+    kept = torch.full_like(term.weights, 0.3)
     kept[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS + LEFT_IRIS + RIGHT_IRIS)] = 1
     return replace(term, weights=term.weights * kept)
 

@@ -17,7 +17,7 @@ from mien.tracking.descent.fit import fit_by_descent
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.resume import StageCache
 from mien.tracking.fitting.sequence import SequenceData, explaining_singular, sequence_data
-from mien.tracking.landmarks.detector_response import read_response
+from mien.tracking.landmarks.detector_response import OFFSET_SIGMA, read_response
 from mien.tracking.landmarks.model import LandmarkModel, reduce_face_model
 from mien.tracking.landmarks.outcome import as_tracking, without_turn_habits
 from mien.tracking.landmarks.problem import Problem, lenses_of
@@ -96,13 +96,13 @@ def track_once(
     data, cache = [sequence_data(capture, settings) for capture in captures], StageCache(keep)
     apart = [sequence_data(capture, settings) for capture in held_out]
     with torch.no_grad():
-        model = _landmark_model(face_model, data, settings)
+        model = _landmark_model(face_model, data)
         problem = Problem(model, data, lenses_of(captures, settings), settings, cache)
         problem = replace(problem, callback=preview and Preview(preview, face_model, problem))
         fits = _fit(problem)
         trackings = _trackings(face_model, replace(problem, callback=None) if apart else problem, fits)
         if apart:
-            model = _landmark_model(face_model, [*data, *apart], settings)
+            model = _landmark_model(face_model, [*data, *apart])
             pieces = StageCache(None if keep is None else keep / "held_out", resumed=cache.resumed)
             motion = Problem(model, apart, [None] * len(apart), settings, pieces)
             motion = replace(motion, callback=preview and Preview(preview, face_model, motion))
@@ -111,12 +111,10 @@ def track_once(
     return trackings
 
 
-def _landmark_model(
-    face_model: FaceModel, sequences: Sequence[SequenceData], settings: TrackingSettings
-) -> LandmarkModel:
+def _landmark_model(face_model: FaceModel, sequences: Sequence[SequenceData]) -> LandmarkModel:
     """The face model's landmarks as the detector sees them."""
     # Sequences of one subject are captured alike. If they are not, the first decides.
-    response = read_response(face_model, settings.bias_sigma, detector_of(sequences[0].capture.source))
+    response = read_response(face_model, OFFSET_SIGMA, detector_of(sequences[0].capture.source))
     if any(len(data.cameras) > 1 for data in sequences):
         # The response to turns was measured for one camera. With several cameras no one of them defines the turn.
         response = response.without_turns()

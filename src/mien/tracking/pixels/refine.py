@@ -40,6 +40,12 @@ _SHARED_STEPS_OF_CAMERAS = 8
 _LEAST_KEYFRAMES = 3
 """Fewest keyframes for any number of cameras, because the mouth must be seen open and closed. Measured: with 16
 cameras, 3 are as good as 24 (log, "Several cameras in the fit")."""
+_INDEPENDENT_PIXELS = 100.0
+"""Number of independent pixels that all pixels of a picture are worth in the steps of identity and focal length,
+because their errors are correlated. It weighs them against landmarks and priors."""
+_INDEPENDENT_PIXELS_OF_FRAMES = 50.0
+"""The same for the steps of frames. If it is much larger, errors of texture, light and shape become expressions, most
+of which follow the head's turns. If it is much smaller, only landmarks determine the shape."""
 _REFERENCE_ANGLE = 0.12
 """Head rotation from the median pose, in radians, within which frames decide the texture; others hardly count. With
 equal weights every pose would keep its own error, because the texture would reproduce it wherever only such frames see
@@ -102,7 +108,7 @@ class _PixelProblem:
         at, settings = self.update_appearance(at), self.problem.settings.photometric
         most = 2 * settings.keyframes // max(data.capture.valid.shape[1] for data in self.problem.data)
         keyframes = min(settings.keyframes, max(most, _LEAST_KEYFRAMES))
-        terms = self.terms(at, settings.independent_pixels)
+        terms = self.terms(at, _INDEPENDENT_PIXELS)
         moved = step_shared(self.problem, terms, self.outlines, at.fit, self.focals, keyframes)
         return replace(at, fit=fit_bias(self.landmarks, moved))
 
@@ -128,7 +134,7 @@ class _PixelProblem:
 
     def residuals(self, at: PhotometricFit) -> PhotometricFit:
         """The fit with the residuals of the frames that were improved."""
-        terms = self.terms(at, self.problem.settings.photometric.independent_pixels_of_frames)
+        terms = self.terms(at, _INDEPENDENT_PIXELS_OF_FRAMES)
         residuals = [
             term.residuals(sequence.state, at.fit.subject, sequence.cameras).where(improved[:, None], torch.nan)
             for term, sequence, improved in zip(terms, at.fit.sequences, at.improved, strict=True)
@@ -189,7 +195,7 @@ def _keep(
 def _pixel_problems(problem: Problem, fit: Fit) -> list[_PixelProblem]:
     """The problem of each iteration."""
     settings = problem.settings.photometric
-    landmarks = [quiet_landmarks(term, settings.landmark_share) for term in problem.landmark_terms(fit)]
+    landmarks = [quiet_landmarks(term) for term in problem.landmark_terms(fit)]
     surface = surface_model(problem.model.face_model, problem.model.layout)
     space = texture_space(surface.face_model, settings.texture_size)
     focals = torch.stack([sequence.cameras.K[0, 0, 0] for sequence in fit.sequences])
@@ -206,7 +212,7 @@ def _pixel_problems(problem: Problem, fit: Fit) -> list[_PixelProblem]:
 def _step_frames(now: _PixelProblem, at: PhotometricFit, name: str, advance: Callable[[int], None]) -> PhotometricFit:
     """Take one step of all timesteps of every sequence. Its pieces are kept under names that begin with `name`."""
     sequences, improved, problem = [], [], now.problem
-    terms = now.terms(at, problem.settings.photometric.independent_pixels_of_frames)
+    terms = now.terms(at, _INDEPENDENT_PIXELS_OF_FRAMES)
     parts = zip(terms, at.fit.sequences, problem.smoothness(at.fit), at.improved, strict=True)
     for number, (term, sequence, smoothness, before) in enumerate(parts):
         pieces = f"{name}-{number}-equations"

@@ -83,7 +83,7 @@ def _prior(problem: Problem, fit: Fit, focals: Float[Tensor, " q"]) -> tuple[Flo
     weights, values = (shared.new_zeros(max(lenses, default=-1) + 1) for _ in range(2))
     for sequence, lens, first in zip(fit.sequences, problem.lenses, focals, strict=True):
         if lens is not None:
-            weights[lens] = problem.settings.photometric.focal_sigma**-2
+            weights[lens] = 0.04**-2  # of the logarithm, around the fit to landmarks
             values[lens] = (sequence.cameras.K[0, 0, 0] / first).log()
     precision = torch.ones_like(shared)
     precision[: len(fit.subject.identity)] = problem.settings.identity_weight

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from mien.avatar.methods import method_named
 from mien.avatar.settings import Differences, MethodConfig
-from mien.disk.config import COUNT, FRACTION, NOT_NEGATIVE, POSITIVE, Range, check_ranges, overlay
+from mien.disk.config import COUNT, FRACTION, NOT_NEGATIVE, Range, check_ranges, overlay
 from mien.disk.reading import MAX_SIDE
 from mien.errors import UserError
 from mien.machine.devices import DeviceName
@@ -196,9 +196,6 @@ class AlignmentSettings:
     """Longer side of the pictures, in pixels, for the quick avatar and for the alignment."""
     iterations: Annotated[int, COUNT] = 8
     """Number of optimiser steps for each frame."""
-    rate: Annotated[float, POSITIVE] = 7e-4
-    """How far a step turns a head whose gradient has the usual size, in radians. Its position moves by 0.3 of it, in
-    metres, joint angles by 3 times and expression coefficients by 10 times as much."""
 
     def check(self) -> None:
         """Check that all numbers are in their ranges."""

@@ -25,10 +25,6 @@ _WORDS = {
 }
 
 
-_KEPT_SECONDS = 5.0
-"""Time over which the rate that people see now is taken."""
-
-
 class Meters:
     """Frames a second of each stage, and the time from a frame to its picture. Any thread may use it."""
 
@@ -53,21 +49,19 @@ class Meters:
             self._delays.append(seconds)
 
     def rates(self, now: float | None = None) -> dict[str, float]:
-        """Frames a second of each stage: of the last seconds before `now`, or (None) of the whole time."""
+        """Frames a second of each stage: of the last five seconds before `now`, or (None) of the whole time."""
         with self._lock:
             if now is None:
                 whole = self._whole.items()
                 return {name: (n - 1) / (last - first) if n > 1 else 0.0 for name, (n, first, last) in whole}
-            begin = now - _KEPT_SECONDS
-            return {name: sum(begin < at for at in recent) / _KEPT_SECONDS for name, recent in self._recent.items()}
+            return {name: sum(now - 5.0 < at for at in recent) / 5.0 for name, recent in self._recent.items()}
 
     def delays(self) -> tuple[float, float, int]:
         """Median and 95th percentile of the delays in seconds, and their number. They are NaN without any."""
         with self._lock:
             delays = np.array(self._delays)
-        if not len(delays):
-            return float("nan"), float("nan"), 0
-        return float(np.median(delays)), float(np.percentile(delays, 95)), len(delays)
+        median, late = np.percentile(delays, (50, 95)) if len(delays) else (np.nan, np.nan)
+        return float(median), float(late), len(delays)
 
     def words(self, now: float | None = None) -> list[str]:
         """Lines for people with the rates and the delays."""
@@ -187,11 +181,7 @@ class CameraSwitch:
             self.meters.count("tracking", self._clock())
 
     def _show(
-        self,
-        follower: "Follower",
-        landmarks: Float[np.ndarray, "l 2"] | None,
-        frame: "LiveFrame",
-        seconds: float,
+        self, follower: "Follower", landmarks: Float[np.ndarray, "l 2"] | None, frame: "LiveFrame", seconds: float
     ) -> None:
         height, width = frame.picture.shape[:2]
         face = follower(landmarks, width, height, seconds)

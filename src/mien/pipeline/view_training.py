@@ -21,11 +21,9 @@ LEAST_SECONDS = 2.0
 """Least time between two pictures of the state."""
 _SHARE = 1 / 40
 """Largest share of the time that training spends on showing itself. The viewer takes another one, at lower priority."""
-_NICE = 5
-_PATIENCE_SECONDS = 5.0
 
 
-class LiveView:
+class TrainingView:
     """Shows the avatar of a run in browsers, from its first steps to its end. Call it after each step."""
 
     def __init__(self, name: str, camera: Camera) -> None:
@@ -57,7 +55,7 @@ class LiveView:
         if self._viewer is not None:
             self._viewer.terminate()
             try:
-                self._viewer.wait(_PATIENCE_SECONDS)
+                self._viewer.wait(5.0)
             except subprocess.TimeoutExpired:
                 self._viewer.kill()
                 self._viewer.wait()
@@ -70,5 +68,5 @@ def start_viewer(file: Path) -> "subprocess.Popen[bytes]":
     environment = {**os.environ, PARENT_VARIABLE: str(os.getpid()), "MIEN_THREADS": "1"}
     command = [sys.executable, "-m", "mien.cli", "view", str(file), "--follow"]
     viewer = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL)
-    lower_priority(viewer.pid, _NICE)
+    lower_priority(viewer.pid, 5)
     return viewer
