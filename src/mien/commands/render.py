@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,7 +15,6 @@ from mien.pipeline.picture_options import PictureOptions
 
 if TYPE_CHECKING:
     import numpy
-    import torch
 
     import mien.avatar
     import mien.camera
@@ -212,11 +211,11 @@ class Render(_Look):
     ) -> "list[mien.camera.Camera]":
         """The camera of each frame."""
         from mien.pipeline.draw import posed_softly, view, whole
-        from mien.render import camera_paths
+        from mien.render.camera_paths import read_cameras, turned_camera
         from mien.tracking.files import read_tracking
 
         if self._is_listed():
-            cameras = camera_paths.read_cameras(Path(self.path))
+            cameras = read_cameras(Path(self.path))
             if timesteps is not None and len(cameras) < timesteps:
                 raise UserError(f"{self.path}: has {len(cameras)} cameras for {timesteps} timesteps; give one for each")
             if any((c.width, c.height) != (cameras[0].width, cameras[0].height) for c in cameras):
@@ -233,28 +232,30 @@ class Render(_Look):
         else:
             first = self.camera(run_dir, avatar.subject, self.picture)
             first = whole(first, posed_softly(avatar)(face[0])) if self.zoom is None else first
-            return self._moved(camera_paths, first, avatar.subject.head_translation[0], self._frames(timesteps))
+            center = avatar.subject.head_translation[0]
+            return [turned_camera(first, center, *angles) for angles in self._angles(self._frames(timesteps))]
         return [self.turned(camera, avatar.subject) for camera in cameras] if self.yaw or self.pitch else cameras
 
     def _draw_file(self) -> None:
         """Draw the avatar of a file, without torch."""
         from mien.pipeline.draw_file import View, render_file
-        from mien.runtime import camera_paths
+        from mien.runtime.camera_paths import turned
 
         frames = self._frames(None)
-        view = View(
-            self.yaw, self.pitch, self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames)
-        )
+        angles = self._angles(frames)
+        view = View(self.yaw, self.pitch, self.zoom, lambda camera, at: [turned(camera, at, *each) for each in angles])
         render_file(self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, view, self.fps)
 
-    def _moved(self, paths: Any, camera: Any, center: "numpy.ndarray | torch.Tensor", frames: int) -> list[Any]:
-        """The cameras of --path, by the module that moves cameras of this type."""
+    def _angles(self, frames: int) -> list[tuple[float, float]]:
+        """Yaw and pitch of the camera of --path in each frame, in radians."""
+        from mien.runtime.camera_paths import sway, turntable
+
         span = math.radians(self.span)
         if self.path == "still" or self._is_still():
-            return [camera] * frames
+            return [(0.0, 0.0)] * frames
         if self.path == "turntable":
-            return paths.turntable(camera, center, frames, span)
-        return paths.sway(camera, center, frames, span, _TILT, crossing=self.path == "sway")
+            return turntable(frames, span)
+        return sway(frames, span, _TILT, crossing=self.path == "sway")
 
     def _is_listed(self) -> bool:
         """Whether the cameras come from a file."""

@@ -1,8 +1,8 @@
 """Gradients of pictures of meshes with respect to the mesh: through the visible surface and through silhouettes.
 
 There are single operations (`image_points`, `differentiable_fragments`, `interpolate`, `sample_texture`, `antialias`)
-and one that combines them with light and a robust loss in a single pass (`mesh_loss`). Each has a twin in plain PyTorch
-in `mien.render.mesh_reference`. They run on one thread, release the GIL, and are deterministic to the bit.
+and one that combines them with light and a robust loss in a single pass (`mesh_loss`). They run on one thread, release
+the GIL, and are deterministic to the bit.
 """
 
 from dataclasses import dataclass, replace
