@@ -95,9 +95,9 @@ def test_the_features_network_equals_its_reference_in_numpy_and_has_directions_t
     along = network.along
     assert along is not None
     for wrong, part in (
-        (replace(along, rest=along.rest[1:], directions=along.directions[1:]), "the shape of rest of its directions"),
+        (replace(along, rest=along.rest[1:], directions=along.directions[1:]), "along.rest has the shape"),
         (replace(along, basis=np.repeat(along.basis, 9, 2)), "288 features, but"),
-        (replace(along, basis=along.basis[1:]), "the shape of basis of its directions"),
+        (replace(along, basis=along.basis[1:]), "along.basis has the shape"),
         (None, "the input features, which does not fit its directions"),
     ):
         baked = replace(whole.baked, network=replace(network, along=wrong))
@@ -115,8 +115,8 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
     for wrong, part in (
         (replace(whole, neutral=replace(whole.neutral, expression=nan)), "NaN"),
         (replace(whole, baked=replace(bound, face_index=bound.face_index + 10**6)), "that does not exist"),
-        (replace(whole, expression_names=("drop",)), "1 expression names"),
-        (replace(whole, joint_names=()), "0 joint names"),
+        (replace(whole, expression_names=("drop",)), "name different expressions"),
+        (replace(whole, joint_names=()), "name different expressions or joints"),
         (replace(whole, baked=replace(bound, rig=replace(bound.rig, joint_parents=(2, 0, 0)))), "before its parent"),
         (replace(whole, baked=replace(bound, rig=many)), "300 expressions and 1 free joints, more than can be posed"),
     ):

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import safetensors
-from jaxtyping import jaxtyped
 
 from mien.disk.config import decode
 from mien.disk.files import check_writable, expect_whole, read_safetensors, write_arrays
@@ -91,7 +90,7 @@ def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> Porta
         tree = _restored(header["content"], dict(arrays))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: is damaged ({repr(error)[:200]}); export it again with `mien export`") from None
-    with expect_whole(path, "export it again with `mien export`"), jaxtyped("context"):
+    with expect_whole(path, "export it again with `mien export`"):
         avatar: PortableAvatar = decode(PortableAvatar, tree, str(path), "export it again with `mien export`")
     check(avatar, str(path))
     return avatar

@@ -33,7 +33,7 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
 def soft_colors(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"]
 ) -> tuple[Int32[np.ndarray, " k"], UInt8[np.ndarray, "k 3"]]:
-    """Return the indices of pixels that are neither empty nor solid, by rows, and their colours in `foreground_colors`."""
+    """Return the indices, by rows, of pixels neither empty nor solid, and their colours in `foreground_colors`."""
     left, top, width, height = cv2.boundingRect(matte)
     if width == 0:
         return np.zeros(0, np.int32), np.zeros((0, 3), np.uint8)
