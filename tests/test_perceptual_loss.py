@@ -16,8 +16,8 @@ from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.media.pictures import Box
+from mien.perceptual import weights_path
 from mien.perceptual.features import load_training_features
-from mien.perceptual.weights import weights_path
 from mien.render.rendering import Rendering
 from mien.training import train
 from mien.training.footage.frames import CROP, random_at
