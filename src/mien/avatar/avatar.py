@@ -114,7 +114,7 @@ class Extras:
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
     closing: int = 0
-    """Pixels by which finished pictures are eroded and then dilated (`mien.render.close_holes`)."""
+    """Pixels by which finished pictures are eroded and then dilated (`close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
 

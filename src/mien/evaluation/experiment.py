@@ -16,7 +16,7 @@ from mien.face.parts import part_boxes
 from mien.gaussians import Gaussians
 from mien.media.pictures import Box
 from mien.render import rasterize
-from mien.render.closing import close_holes
+from mien.render.rasterize import close_holes
 from mien.render.rendering import Rendering
 from mien.render.validation import drawable
 from mien.tracking.scoring import Scoring

@@ -17,7 +17,7 @@ from mien.machine.progress import say
 from mien.media.pixels import to_rgb, to_rgba
 from mien.pipeline.picture_options import PictureOptions
 from mien.render import rasterize
-from mien.render.closing import close_holes
+from mien.render.rasterize import close_holes
 from mien.render.validation import drawable
 from mien.runtime.camera_paths import zoom_for_all
 from mien.training.footage.filmed import filmed_words, read_coverage

@@ -31,10 +31,7 @@ def zoom_for_all(shown: Callable[[float], Bool[np.ndarray, "h w"]]) -> float:
     """The largest magnification, of 1 and less, at which a head reaches neither the top nor a side of the picture.
 
     A filmed frame may cut off the crown of a head, which the avatar has. A neck may end at the bottom. What fills any
-    picture keeps 1.
-
-    Args:
-        shown: Returns where anything is drawn, at a magnification.
+    picture keeps 1. `shown` returns where anything is drawn, at a magnification.
     """
     for zoom in _ZOOMS:
         mask = shown(zoom)

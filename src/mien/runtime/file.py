@@ -28,11 +28,7 @@ _REMEDY = "write one with `mien export DIR --out me.mien`"
 
 
 def write_portable(path: Path, avatar: PortableAvatar) -> None:
-    """Write a .mien file atomically. The same avatar gives the same bytes.
-
-    Raises:
-        UserError: the path cannot be written, or an array holds NaN or infinity.
-    """
+    """Write a .mien file atomically. The same avatar gives the same bytes."""
     check_writable(path)
     header, arrays = to_arrays(path, avatar)
     # A single entry, because safetensors writes several in random order.
@@ -40,11 +36,7 @@ def write_portable(path: Path, avatar: PortableAvatar) -> None:
 
 
 def read_portable(path: Path) -> PortableAvatar:
-    """Read a .mien file. All of its content is checked, so that the result can be posed.
-
-    Raises:
-        UserError: the file is missing, damaged, of another version, or not a .mien file.
-    """
+    """Read a .mien file. All of its content is checked, so that the result can be posed."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; {_REMEDY}")
     if path.stat().st_size > _MAX_BYTES:
