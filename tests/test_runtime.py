@@ -178,7 +178,7 @@ def talking_face(model: FaceModel) -> FaceParams:
 def grown_avatar(model: FaceModel, face: FaceParams, config: MethodConfig, count: int) -> Avatar:
     """Return an avatar as training leaves it: several Gaussians per triangle, small, coloured, mostly opaque."""
     avatar = METHODS[DEFAULT_METHOD].avatar(config, model, face)
-    store = avatar.gaussian_store()
+    store = avatar.store
     store.append(torch.arange(count - len(store)) % len(store))
     store.assign("means", 0.3 * noise(7, count, 3))
     store.assign("quats", noise(8, count, 4))
@@ -223,7 +223,7 @@ def test_every_pixel_equals_that_of_training(colors: dict[str, Any], tmp_path: P
     model, camera = load_face_model("anny"), view(WIDE)
     face = talking_face(model)
     avatar = grown_avatar(model, face, plain_config(DEFAULT_METHOD, **colors), GAUSSIANS)
-    assert len(avatar.gaussian_store()) == GAUSSIANS
+    assert len(avatar.store) == GAUSSIANS
     expected = rasterize(avatar.pose(face).gaussians, [camera] * TIMESTEPS, torch.ones(3))
     found = rendered_without_torch(avatar, face, camera, tmp_path)
     assert found["image"].shape == (TIMESTEPS, WIDE, WIDE, 3)

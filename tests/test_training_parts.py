@@ -204,7 +204,7 @@ def test_first_colors_come_from_training_frames_only() -> None:
         images[black] = 0
         given = replace(sequence, capture=replace(sequence.capture, images=images))
         state = start([given], face_model, plain_gaussian_avatars(**changes), plain_run(split="blocks"))
-        return state.avatar.gaussian_store()["sh_constant"].detach()
+        return state.avatar.store["sh_constant"].detach()
 
     painted = first(first_colors="pictures")
     assert float((rgb_from_sh(first()) - 0.5).abs().max()) < 0.01

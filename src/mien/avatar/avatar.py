@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import final
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -108,7 +107,7 @@ class Extras:
     """Properties that only some methods have. The defaults are those of most methods."""
 
     surface: BoundSurface | None = None
-    """The surface that the Gaussians are bound to."""
+    """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
     frames_per_step: Callable[[], int] = lambda: 1
     """Returns the number of training frames that the next optimiser step uses."""
     pretraining: Pretraining | None = None
@@ -162,16 +161,6 @@ class Avatar(nn.Module, ABC):
     @abstractmethod
     def bake(self) -> BakedAvatar:
         """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""
-
-    @final
-    def gaussian_store(self) -> GaussianStore:
-        """The store that holds every per-Gaussian tensor."""
-        return self.store
-
-    @final
-    def surface(self) -> BoundSurface | None:
-        """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
-        return self.extras.surface
 
 
 def move_avatar(avatar: Avatar, like: Tensor) -> None:

@@ -182,7 +182,7 @@ class Render(_Look):
         pictures = (picture(index) for index in range(len(cameras)))
         shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
         write_pictures(output, shown, self.fps)
-        count, first = len(avatar.gaussian_store()), cameras[0]
+        count, first = len(avatar.store), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
         if sides is not None:
             say(sides)
@@ -332,7 +332,7 @@ class Sheet(_Look):
             tiles = sheets.nearer_tiles(tiles, picture, (red, green, blue))
         output = self.picture.plan(self._output, 1)
         write_pictures(output, [sheets.draw_sheet(tiles, picture, (red, green, blue))], 25.0)
-        say(f"{self._output}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
+        say(f"{self._output}: {len(tiles)} pictures of {len(avatar.store):,} Gaussians")
         if sides is not None:
             say(sides)
 

@@ -94,5 +94,5 @@ def sides_filmed(run_dir: Path, avatar: Avatar) -> str | None:
 def _trained_over_white(settings: dict[str, Any], avatar: Avatar) -> bool:
     """Whether a run had a white background. `auto` is random where avatar and settings can fill sides."""
     background = settings.get("background")
-    may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
+    may_fill = avatar.extras.surface is not None and settings.get("unseen") != "trained"
     return background == "white" or (background == "auto" and not may_fill)

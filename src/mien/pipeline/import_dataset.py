@@ -89,7 +89,7 @@ def _write_run(content: TrainedAvatar, run_dir: Path, source: Path) -> None:
         except BaseException:
             remove_tree(run_dir)
             raise
-    count = counted(len(avatar.gaussian_store()), "Gaussian")
+    count = counted(len(avatar.store), "Gaussian")
     say(f"{run_dir}: {count} on {avatar.face_model.name}, {counted(len(face), 'timestep')}")
 
 

@@ -63,7 +63,7 @@ def headgas_case(
 @torch.no_grad()
 def _fill(avatar: HeadGas, count: int) -> None:
     """Give an avatar small and mostly opaque Gaussians that change with the expression, as training would."""
-    store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    store, generator = avatar.store, torch.Generator().manual_seed(0)
     store.select(torch.arange(count) % len(store))
     store.assign("means", store["means"] + 0.002 * torch.randn(count, 3, generator=generator))
     store.assign("quats", torch.randn(count, 4, generator=generator))
