@@ -102,9 +102,9 @@ def main() -> None:
         if not kept.is_file():
             avatar = train([sequence], face_model, config, settings, run_dir)
             faces = FaceParams(**read_tensors(run_dir / "face_track.safetensors"))
-            filled = len(avatar.gaussian_store()["face_index"].unique())
+            filled = len(avatar.store["face_index"].unique())
             row = scores(avatar, faces, sequence, scoring)
-            row |= {"gaussians": len(avatar.gaussian_store()), "ms": median(read_curves(run_dir)["step_ms"].tolist())}
+            row |= {"gaussians": len(avatar.store), "ms": median(read_curves(run_dir)["step_ms"].tolist())}
             kept.write_text(json.dumps(row | {"empty": len(face_model.faces) - filled}))
         row = json.loads(kept.read_text())
         figures = f"{row['view']:.2f} | {row['frames']:.2f} | {row['gaussians']:,} | {row['ms']:.1f} | {row['empty']}"

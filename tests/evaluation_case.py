@@ -66,7 +66,7 @@ def _motion(face: FaceParams) -> FaceParams:
 
 def _paint(avatar: Avatar) -> None:
     """Make the Gaussians opaque and small, with colours that depend on the place on the head."""
-    model, store = avatar.face_model, avatar.gaussian_store()
+    model, store = avatar.face_model, avatar.store
     middle = model.template[model.faces].mean(1)
     rgb = (middle / middle.abs().max() * 0.5 + 0.5).clamp(0.05, 0.95)
     with torch.no_grad():

@@ -30,7 +30,7 @@ from mien.pipeline.names import check_neutral
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking import read_tracking
 from mien.training import TrainSettings, train
-from mien.training.alignment import FaceDescent, align, align_faces, steadier
+from mien.training.alignment import align, align_faces, descend, steadier
 from mien.training.settings import AlignmentSettings
 from refusals import complaint, refuses
 from shared_things import write_sequence, write_toy_workspace
@@ -115,8 +115,7 @@ def test_what_matters_more_moves_further() -> None:
     values = torch.zeros(1, 2, requires_grad=True)
     group = ParameterGroup("face", {"face": values}, Rate(0.01), {"face": Moments.zeros(values.detach())})
     values.grad = torch.tensor([[4.0, 1.0]])
-    descent = FaceDescent({"face": 2.0})
-    descent.step([group])
+    descend([group], {"face": 2.0})
     assert torch.allclose(values, torch.tensor([[-0.02, -0.005]]))
     assert values.grad is None
 

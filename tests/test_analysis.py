@@ -100,7 +100,7 @@ def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[st
     runs = [next((folder / "runs").glob(f"{name}-2-*")) for name in ("scale-threshold", "scale-no-threshold")]
     for row, avatar in zip(trained, map(load_avatar, runs), strict=True):
         assert avatar.config.scale_threshold == (0.6 if row == trained[0] else 0)  # type: ignore[attr-defined]
-        largest = avatar.gaussian_store()["log_scales"].detach().exp().amax(-1)
+        largest = avatar.store["log_scales"].detach().exp().amax(-1)
         assert row["median_scale"] == pytest.approx(float(largest.median()), abs=6e-4)
     teeth = parts["teeth"]["values"]
     assert 0 < teeth["teeth_gaussians"] < teeth["gaussians"]

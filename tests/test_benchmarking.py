@@ -120,13 +120,13 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...]) -> None:
     """The benchmarked step is the trainer's own, on pictures from which it can learn."""
     state, data = made()
-    begun, before = state.step, state.avatar.gaussian_store()[name].detach().clone()
+    begun, before = state.step, state.avatar.store[name].detach().clone()
     matte = data.targets[0].target(0, 0, np.full(3, 255, np.uint8), keep=False).matte
     assert 0.2 < (matte > 127).float().mean() < 0.8, "the head fills about half of the picture"
     for _ in range(count):
         step(state, data, train_step.SETTINGS)
     assert (state.step - begun, before.shape) == (count, shape)
-    assert not torch.equal(before, state.avatar.gaussian_store()[name])
+    assert not torch.equal(before, state.avatar.store[name])
 
 
 def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -23,7 +23,7 @@ from mien.training.adam import Adam
 from mien.training.alignment import align_faces
 from mien.training.checkpoint import checkpoint_files
 from mien.training.colors import CameraColors, FrameGains, frame_gains, lit, read_gains
-from mien.training.footage.foreground import foreground_colors, soft_colors, soft_pixels
+from mien.training.footage.foreground import foreground_colors, soft_colors
 from mien.training.footage.frames import Frame, training_frames
 from mien.training.footage.sequence import Sequence, Targets, composite
 from mien.training.settings import AlignmentSettings
@@ -157,7 +157,7 @@ def test_soft_edges_have_the_color_of_the_person_in_large_pictures_as_well() -> 
     # A window of 273 pixels holds a sum of colours that 32 bits do not.
     image, matte = _filmed(3000, 250.0, slice(1300, 1700))
     part = (slice(100, 300), slice(2300, 2500))
-    share, soft = matte[part][..., None] / 255.0, soft_pixels(matte[part])
+    share, soft = matte[part][..., None] / 255.0, (matte[part] > 0) & (matte[part] < 252)
     error = np.abs(foreground_colors(image, matte)[part] - _person(3000, 250.0)[1400:1600]) * share
     assert error[soft].mean() < 3
 
@@ -171,7 +171,7 @@ def test_estimates_at_soft_pixels_alone_are_those_of_whole_pictures(size: tuple[
     matte[:7], matte[:, -5:], matte[20:40, 8:30] = 0, 255, 0
     expected, (place, colors) = foreground_colors(image, matte), soft_colors(image, matte)
     assert not foreground_colors(image, np.zeros_like(matte)).any()
-    assert np.array_equal(place, np.flatnonzero(soft_pixels(matte)))
+    assert np.array_equal(place, np.flatnonzero((matte > 0) & (matte < 252)))
     assert np.array_equal(colors, expected.reshape(-1, 3)[place])
 
 
@@ -191,7 +191,7 @@ def test_training_pictures_are_cleaned_with_the_capture_s_matte(monkeypatch) -> 
     sequence = replace(sequence, scoring=cut)
     background = np.array([10, 20, 30], np.uint8)
     image, matte = (np.array(part[1, 0]) for part in (sequence.capture.images, sequence.capture.mattes))
-    assert soft_pixels(matte).any()
+    assert ((matte > 0) & (matte < 252)).any()
     expected = composite(foreground_colors(image, matte), cut[1, 0], background)
     cleaned = counted(monkeypatch)
     for keep in (True, False):

@@ -128,7 +128,7 @@ def measured(toy: Toy, avatar: Avatar) -> Unseen:
 def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     """Fills have no gradients but those that move them along their normal."""
     sequence, avatar = toy[1], bare_avatar(toy)
-    unseen, store = measured(toy, avatar), avatar.gaussian_store()
+    unseen, store = measured(toy, avatar), avatar.store
     surface_of(avatar).close(unseen.prior)
     filled_in = known(unseen.filled_in(surface_of(avatar)))
     assert 0 < int(filled_in.sum()) < len(filled_in)
@@ -151,7 +151,7 @@ def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     config = plain_gaussian_avatars(appearance="features", appearance_directions=2, appearance_features=3)
     avatar = METHODS["gaussian_avatars"].avatar(config, model, sequence.tracking.face)
     with torch.no_grad():
-        avatar.gaussian_store()["feature_bases"].normal_()
+        avatar.store["feature_bases"].normal_()
         (network,) = (group for group in avatar.parameter_groups() if group.name == "appearance")
         for tensor in network.tensors.values():
             tensor.normal_()
@@ -191,7 +191,7 @@ def test_what_is_beside_shown_triangles_is_trained(toy: Toy, monkeypatch: pytest
 
 def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
     avatar = bare_avatar(toy)
-    unseen, store = measured(toy, avatar), avatar.gaussian_store()
+    unseen, store = measured(toy, avatar), avatar.store
     surface_of(avatar).close(unseen.prior)
     before, fills = store["opacity_logits"].sigmoid(), known(unseen.filled_in(surface_of(avatar)))
     control = spare_fills(surface_of(avatar), avatar.density(), unseen)
@@ -221,24 +221,24 @@ def test_fills_close_the_head(toy: Toy) -> None:
     hair = torch.zeros(len(filled_in))
     prior = SurfacePrior(hair, None, color.expand(len(filled_in), 3), filled_in.float(), filled_in)
     surface_of(avatar).close(prior)
-    assert len(avatar.gaussian_store()) == len(filled_in)
+    assert len(avatar.store) == len(filled_in)
     camera = view_of_head(model.head_vertices(avatar.subject)[0], 180)
     turned = replace(avatar.subject, head_rotation=torch.zeros(1, 3), head_translation=torch.zeros(1, 3))
     rendering = rasterize(avatar.pose(turned).gaussians.timestep(0), camera, torch.ones(3))
     assert rendering.alpha[56:72, 56:72].min() > 0.95
     torch.testing.assert_close(rendering.image[56:72, 56:72].mean((0, 1)), color, atol=0.03, rtol=0)
     surface_of(avatar).close(replace(prior, hair=hair + 0.02))
-    assert (avatar.gaussian_store()["means"][:, 1] > 0).all()
+    assert (avatar.store["means"][:, 1] > 0).all()
 
 
 def test_colors_are_pulled_where_nothing_shows_them(toy: Toy) -> None:
     avatar, doubt = bare_avatar(toy), (facing(toy[0]) <= 0).float()
-    before = avatar.gaussian_store()["sh_constant"].detach().clone()
+    before = avatar.store["sh_constant"].detach().clone()
     prior = SurfacePrior(0 * doubt, None, torch.ones(len(doubt), 3), doubt)
     for filled_in, pulled in ((doubt > 0, doubt > 1), (None, doubt > 0)):  # what is made up keeps its colours
         for _ in range(200):
             surface_of(avatar).keep_to(replace(prior, filled_in=filled_in))
-        colors = avatar.gaussian_store()["sh_constant"].detach()
+        colors = avatar.store["sh_constant"].detach()
         assert torch.equal(colors[~pulled], before[~pulled])
         torch.testing.assert_close(rgb_from_sh(colors[pulled]), torch.ones_like(colors[pulled]), atol=1e-3, rtol=0)
 
@@ -247,7 +247,7 @@ def test_hanging_hair_may_stand_out_from_the_surface(toy: Toy) -> None:
     """Fills have limits to the surface, and hair that hangs beside a triangle widens them there alone."""
     avatar, none = bare_avatar(toy), torch.zeros(len(toy[0].faces))
     hanging = 0.05 * (torch.arange(len(none)) % 2).float()
-    store = avatar.gaussian_store()
+    store = avatar.store
     with torch.no_grad():
         store["means"][:, 1] = 1e3
     surface_of(avatar).keep_to(SurfacePrior(none, hanging, None, None, none.bool()))
@@ -265,7 +265,7 @@ def test_a_run_keeps_its_coverage(toy: Toy, tmp_path: Path) -> None:
     assert filled_in.any()
     assert (whole.pose(sequence.tracking.face[0]).gaussians.opacities[filled_in] > 0.69).all()
     plain = train([sequence], model, config, replace(SETTINGS, unseen="trained"), tmp_path / "plain")
-    assert len(plain.gaussian_store()["face_index"].unique()) == len(model.faces)
+    assert len(plain.store["face_index"].unique()) == len(model.faces)
     for name in ("whole", "plain"):  # each run knows what was filmed
         assert torch.equal(known(read_coverage(tmp_path / name, model)).seen, seen)
 

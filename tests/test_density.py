@@ -16,9 +16,9 @@ from mien.avatar.settings import GradientSettings, Progress, RefillSettings
 from mien.avatar.store import GaussianStore
 from mien.gaussians import Gaussians, Rendering
 from mien.rotation import matrix_from_quaternion
-from mien.training.density_control import density_strategy
 from mien.training.density_control.gradient import GradientStrategy
 from mien.training.density_control.refill import RefillStrategy
+from mien.training.trainer import density_strategy
 
 WIDTH, HEIGHT, FIRST = 40, 20, Progress(0, 100)
 EVERY_STEP = GradientSettings(start=0.0, stop=1.0, rounds=101, split_size=0.0025, opacity_resets=())

@@ -77,7 +77,7 @@ def test_plain_pytorch_trains_as_the_native_core_does(scene: Scene, monkeypatch:
     for name in f"{parts} observe_view adam_update mean_squared_difference absolute_difference".split():
         monkeypatch.setattr(_native, name, refuse)
     plain = train_some(scene, torch.zeros((), dtype=torch.float64))
-    assert plain.avatar.gaussian_store()["means"].dtype == torch.float64
+    assert plain.avatar.store["means"].dtype == torch.float64
     assert plain.curves["gaussians"] == native.curves["gaussians"]
     assert len(set(native.curves["gaussians"])) > 1  # density control has run
     assert_alike(plain, native)
@@ -108,13 +108,13 @@ def test_a_run_goes_on_elsewhere(scene: Scene, tmp_path: Path, no_gpu: None) -> 
     train([sequence], face_model, train_toy.CONFIG, replace(SETTINGS, device="auto"), tmp_path / "run", silence)
     # The run is finished. On another device it is the same run, and is only loaded.
     again = train([sequence], face_model, train_toy.CONFIG, SETTINGS, tmp_path / "run", silence)
-    assert len(again.gaussian_store()) > 0
+    assert len(again.store) > 0
 
 
 @pytest.mark.gpu
 def test_a_gpu_trains_as_the_native_core_does_and_its_run_goes_on_without_one(scene: Scene, tmp_path: Path) -> None:
     native, on_gpu = train_some(scene, torch.zeros(())), train_some(scene, like_on("cuda"))
-    store = on_gpu.avatar.gaussian_store()
+    store = on_gpu.avatar.store
     assert all(store[name].is_cuda for name in store.names())
     assert_alike(on_gpu, native)
     face_model, sequence = scene
@@ -122,7 +122,7 @@ def test_a_gpu_trains_as_the_native_core_does_and_its_run_goes_on_without_one(sc
     with pytest.raises(KeyboardInterrupt):
         train([sequence], face_model, train_toy.CONFIG, often, tmp_path, stopped_at(SETTINGS.steps // 2))
     train([sequence], face_model, train_toy.CONFIG, replace(often, device="cpu"), tmp_path, silence)
-    assert load_avatar(tmp_path).gaussian_store()["means"].device.type == "cpu"
+    assert load_avatar(tmp_path).store["means"].device.type == "cpu"
 
 
 @pytest.mark.unchecked
@@ -136,7 +136,7 @@ def test_a_whole_head_is_trained_on_a_device(device: str, monkeypatch: pytest.Mo
     settings = TrainSettings(steps=4, split="none", unseen="filled", mesh="fitted", record_every=1)
     state = train_some(toy_sequence(timesteps=5, size=16), like, GaussianAvatarsConfig(), settings)
     assert corrections[0]
-    store = state.avatar.gaussian_store()
+    store = state.avatar.store
     assert all(store[name].device.type == like.device.type for name in store.names())
     assert all(torch.isfinite(store[name]).all() for name in store.trained)
 
@@ -192,7 +192,7 @@ def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch
     for _ in range(3):
         trainer.step(state, data, settings)
     state.track.steady_pose()
-    store = state.avatar.gaussian_store()
+    store = state.avatar.store
     assert all(store[name].device.type == "meta" for name in store.names())
     updated = {**store.moments, **state.adam.state()}
     assert updated

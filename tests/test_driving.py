@@ -25,8 +25,9 @@ from mien.face import FaceParams, load_face_model
 from mien.media.video import probe_video, write_video
 from mien.pipeline import drive as driving
 from mien.pipeline.drive import open_driver, run_driving_stage
-from mien.render.camera_paths import orbit, turned_camera, turntable
+from mien.render.camera_paths import turned_camera
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.camera_paths import turntable
 from mien.tracking.tracking import Tracking
 from recordings import LAYOUTS, row, write_csv
 from refusals import refuses
@@ -78,7 +79,7 @@ def test_motion_is_done_in_the_avatars_own_frame() -> None:
 def test_turntables_and_cameras_aside_keep_the_center_in_its_place() -> None:
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center = torch.tensor([0.02, 0.05, -0.6])
-    path = turntable(camera, center, 8)
+    path = [turned_camera(camera, center, *angles) for angles in turntable(8, 2 * math.pi)]
     place, depth = camera.project(center)
     for view in path:
         pixel, far = view.project(center)
@@ -89,9 +90,8 @@ def test_turntables_and_cameras_aside_keep_the_center_in_its_place() -> None:
     # A quarter turn, counter-clockwise from above (from +z towards +x), looks along -x.
     for index, offset, most in ((2, [0.6, -0.05, 0.02], 1e-6), (4, [0.02, -0.05, -0.6], 1e-5)):
         torch.testing.assert_close(path[index].position, center + torch.tensor(offset), atol=most, rtol=0)
-    swing = turntable(camera, center, 8, span=1.0)
-    for index, angle in ((2, 0.5), (6, -0.5), (4, 0.0)):
-        torch.testing.assert_close(swing[index].viewmat, orbit(camera, center, angle).viewmat, atol=1e-6, rtol=0)
+    swing = turntable(8, span=1.0)
+    assert [swing[index][0] for index in (0, 2, 6, 4)] == pytest.approx([0, 0.5, -0.5, 0])
     # A yaw of 90 degrees looks at the person's left side, a pitch of 30 from above, and 0 changes no bit.
     camera = camera_from_fov(0.5, 64, 48, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     center, ahead = torch.tensor([0.0, 0.0, -0.6]), 0.6 * math.sqrt(0.75)

@@ -21,8 +21,8 @@ from mien.face.checks import check_face_model
 from mien.face.mirror import triangle_geometry
 from mien.lab.synthetic.recipe import Segment, SyntheticRecipe
 from mien.pipeline.expression import with_expression
-from mien.render.camera_paths import sway
-from mien.runtime.camera_paths import zoom_for_all
+from mien.render.camera_paths import turned_camera
+from mien.runtime.camera_paths import sway, zoom_for_all
 from mien.tracking.fitting.views import Views
 from mien.tracking.scoring import cut_matte
 from refusals import refuses
@@ -90,7 +90,8 @@ def test_normals_of_triangles_point_to_where_corners_run_counterclockwise() -> N
 def test_a_figure_eight_crosses_itself_in_the_middle_and_an_oval_does_not() -> None:
     camera, center = toy_camera(64), torch.tensor([0.0, 0.0, -0.5])
     for crossing in (True, False):
-        places = torch.stack([view.position for view in sway(camera, center, 8, 0.6, 0.2, crossing)])
+        views = [turned_camera(camera, center, *angles) for angles in sway(8, 0.6, 0.2, crossing)]
+        places = torch.stack([view.position for view in views])
         height, side = places[:, 1], places[:, 0]
         assert float(side[2]) > 0.1 > -0.1 > float(side[6])
         # A quarter of the way it is farthest to one side. A figure eight is at half its height there.

@@ -61,7 +61,7 @@ def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment
 def test_an_avatar_that_white_shines_through_is_told_over_dark_blue() -> None:
     """The person is white. The avatar of half the opacity looks the same over white, and worse over dark blue."""
     experiment = replace(make_experiment(20), edges="cleaned")
-    sequence, store = experiment.sequences[0], experiment.avatar.gaussian_store()
+    sequence, store = experiment.sequences[0], experiment.avatar.store
     with torch.no_grad():
         store["sh_constant"].copy_(sh_from_rgb(torch.ones(len(store["sh_constant"]), 3))[:, None])
     white = drawn_sequence(experiment.avatar, sequence.tracking.face, experiment.camera(experiment.held_out_frames[0]))

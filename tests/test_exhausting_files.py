@@ -320,7 +320,7 @@ def test_poses_of_mien_files() -> None:
     posed = replace(baked, still_weights=weights, still_pose=TURN.astype(np.float32))
     check(replace(portable, baked=posed), "a.mien")
     for wrong, words in (
-        (weights[1:], "weights of the bone that"), (np.append(weights, weights[:1]), "weights of the bone that"),
+        (weights[1:], "still_weights has the shape"), (np.append(weights, weights[:1]), "still_weights has the shape"),
         (None, "weights or a pose, but not both"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=words):

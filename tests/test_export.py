@@ -29,8 +29,9 @@ from mien.media.writing import write_pictures
 from mien.pipeline.draw import draw
 from mien.pipeline.picture_options import PictureOptions
 from mien.render import rasterize
-from mien.render.camera_paths import read_cameras, sway, write_cameras
+from mien.render.camera_paths import read_cameras, turned_camera
 from mien.rotation import matrix_from_axis_angle, rigid_transform
+from mien.runtime.camera_paths import sway
 from refusals import refuses
 from shared_things import MadeOnce, toy_workspace
 from test_splat_files import some
@@ -209,18 +210,19 @@ def test_one_view_over_every_background() -> None:
 
 def test_cameras_sway_around_the_head_and_come_from_a_file(tmp_path: Path) -> None:
     camera, center = camera_from_fov(0.5, 64, 64, FACING), torch.tensor([0.0, 0.0, -0.6])
-    views = sway(camera, center, 8, math.radians(40), math.radians(20))
+    angles = sway(8, math.radians(40), math.radians(20))
+    views = [turned_camera(camera, center, *each) for each in angles]
     torch.testing.assert_close(views[0].viewmat, camera.viewmat, atol=1e-6, rtol=0)
     for view in views:
         torch.testing.assert_close(view.project(center)[0], torch.tensor([32.0, 32.0]), atol=1e-3, rtol=0)
         assert float((view.position - center).norm()) == pytest.approx(0.6, abs=1e-5)
     assert float((views[2].position - center)[0]) == pytest.approx(0.6 * math.sin(math.radians(20)), abs=1e-5)
     path, camera = tmp_path / "path.json", camera_from_fov(0.6, 100, 80, FACING)
-    write_cameras(path, [camera, camera])
+    entry = {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist(), "width": 100, "height": 80}
+    write_json(path, "mien.cameras", 1, {"cameras": [entry, entry]})
     _, read = read_cameras(path)
     assert torch.equal(read.viewmat, camera.viewmat)
     assert torch.equal(read.K, camera.K)
-    entry = {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist(), "width": 100, "height": 80}
     turned = entry | {"viewmat": (2 * torch.eye(4)).tolist()}
     for wrong, part in (
         ([], "no list"), ([entry | {"K": [[1]]}], "camera 0: K must be 3x3"), ([3], "has no K"),

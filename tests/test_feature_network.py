@@ -7,7 +7,7 @@ from torch import Tensor
 from known import known
 from mien import _native
 from mien.adam import FactoredGradient, FactoredMoments, Moments
-from mien.avatar.ops.feature_network import Layers, feature_network, feature_network_reference
+from mien.avatar.ops.feature_network import Layers, feature_network, network_outputs
 from mien.training.adam import (
     FactoredUpdate,
     Update,
@@ -54,10 +54,10 @@ def ours(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
 
 
 def theirs(given: list[Tensor], by: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """The same in float64 by `feature_network_reference`."""
+    """The same in float64 and plain PyTorch."""
     leaves = [tensor.double().requires_grad_() for tensor in given]
     bases, inputs, neutral, own, *layers = leaves
-    outputs = feature_network_reference(bases, inputs, neutral, own, Layers(*layers))
+    outputs = network_outputs(neutral + torch.einsum("nkf,k->nf", bases, inputs), own, Layers(*layers))
     return [
         tensor.detach() for tensor in (*outputs, *torch.autograd.grad(outputs, leaves, [one.double() for one in by]))
     ]

@@ -32,12 +32,12 @@ def new_avatar(face_model: FaceModel, face: FaceParams, **config: object) -> Ava
     """Return an avatar of GaussianAvatars with several Gaussians on some triangles, whose values are all random."""
     method = METHODS["gaussian_avatars"]
     avatar = method.avatar(plain_gaussian_avatars(**config), face_model, face)
-    avatar.gaussian_store().append(torch.arange(0, len(face_model.faces), 3))
+    avatar.store.append(torch.arange(0, len(face_model.faces), 3))
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in avatar.parameters():
             parameter.add_(0.2 * torch.randn(parameter.shape, generator=generator))
-        avatar.gaussian_store()["opacity_logits"].add_(3)
+        avatar.store["opacity_logits"].add_(3)
     return avatar
 
 
@@ -82,7 +82,7 @@ def test_a_written_folder_draws_the_same(config: dict, tmp_path: Path) -> None:
     avatar = new_avatar(model, face, **config)
     write_gaussian_avatars_folder(tmp_path / "a", avatar, face)
     read = read_gaussian_avatars_folder(tmp_path / "a")
-    assert len(read.avatar.gaussian_store()) == len(avatar.gaussian_store()) > len(model.faces)
+    assert len(read.avatar.store) == len(avatar.store) > len(model.faces)
     assert read.avatar.face_model.content_hash == model.content_hash
     pictures = drawn(avatar, face)
     assert float((pictures[0] - pictures[2]).abs().max()) > 0.05

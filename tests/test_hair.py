@@ -177,7 +177,7 @@ def test_strands_cover_the_chosen_triangles_hang_in_the_surface_and_keep_their_c
     chosen, count = _back(anny), len(anny.faces)
     config = PRESETS["standard"].config("gaussian_avatars")
     avatar = method_named("gaussian_avatars").avatar(config, anny, anny.neutral(1))
-    store, bald = avatar.gaussian_store(), len(avatar.gaussian_store())
+    store, bald = avatar.store, len(avatar.store)
     hair, color = torch.full((count,), _HAIR), torch.full((count, 3), 0.4)
     prior = SurfacePrior(hair, colors=color, doubt=chosen.float(), filled_in=chosen, strands=chosen)
     surface_of(avatar).close(prior)

@@ -103,7 +103,7 @@ def test_a_mouth_that_no_picture_shows_is_a_dark_closed_surface(toy: tuple[FaceM
     assert (prior.widening[inside] > 1).all()
     assert (prior.widening[~inside] == 1).all()
     surface_of(avatar).close(prior)
-    store = avatar.gaussian_store()
+    store = avatar.store
     own = inside[store["face_index"]]
     assert (store["opacity_logits"].sigmoid()[own] > 0.9).all()
     assert (rgb_from_sh(store["sh_constant"][own][:, 0]) < 0.4).all()
@@ -123,7 +123,7 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
     assert torch.equal(changed.gaussians.sh[~hidden], posed.gaussians.sh[~hidden])
     assert torch.equal(changed.gaussians.opacities, posed.gaussians.opacities)
     rasterize(changed.gaussians.timestep(0), sequence.tracking.cameras[0], torch.ones(3)).image.sum().backward()
-    store = avatar.gaussian_store()
+    store = avatar.store
     for name, trained in (("opacity_logits", False), ("sh_constant", False), ("means", True)):
         gradient = store[name].grad
         assert gradient is not None
@@ -143,7 +143,7 @@ def test_hidden_gaussians_have_another_color_and_do_not_fade(toy: tuple[FaceMode
 
 def test_open_surface_is_closed_and_the_rest_stays(toy: tuple[FaceModel, Sequence]) -> None:
     avatar, inside = made(toy), toy[0].face_regions == 1
-    store, half = avatar.gaussian_store(), inside.nonzero()[: int(inside.sum()) // 2, 0]
+    store, half = avatar.store, inside.nonzero()[: int(inside.sum()) // 2, 0]
     opaque = store["opacity_logits"].detach().clone()
     opaque[half] = 2.0
     store.assign("opacity_logits", opaque)
@@ -179,8 +179,8 @@ def test_a_run_resumes_exactly(toy: tuple[FaceModel, Sequence], tmp_path: Path) 
     """It stops after the step at which the surface is closed, and before it."""
     settings = replace(SETTINGS, inside="filled", steps=6, checkpoint_every=2, record_every=1)
     given = [toy[1]], toy[0], plain_gaussian_avatars(), settings, tmp_path / "cut"
-    means = train(*given).gaussian_store()["means"].clone()
+    means = train(*given).store["means"].clone()
     for lost in ("6", "[46]"):
         for path in (tmp_path / "cut/training.json", *(tmp_path / "cut/checkpoints").glob(f"*{lost}.safetensors")):
             path.unlink()
-        assert torch.equal(train(*given).gaussian_store()["means"], means)
+        assert torch.equal(train(*given).store["means"], means)

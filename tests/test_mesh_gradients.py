@@ -1,4 +1,4 @@
-"""Gradients through rasterized meshes, native and in PyTorch, agree with finite differences and areas."""
+"""Gradients through rasterized meshes agree with finite differences of the same operations in float64, and areas."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from mesh_reference import antialias_reference, barycentrics_reference, mesh_loss_reference, sample_texture_reference
 from mien import _native
 from mien.face import FaceModel
 from mien.render.mesh import MeshFragments, interpolate, interpolate_reference, rasterize_mesh, sample_texture
@@ -18,12 +19,6 @@ from mien.render.mesh_gradients import (
     image_points,
     mesh_edges,
     mesh_loss,
-)
-from mien.render.mesh_reference import (
-    antialias_reference,
-    barycentrics_reference,
-    mesh_loss_reference,
-    sample_texture_reference,
 )
 from test_mesh import camera_at
 
@@ -87,55 +82,45 @@ def assert_close(value: Tensor, expected: Tensor | tuple[Tensor, Tensor], relati
     assert float((value.double() - expected).norm() / expected.norm()) < relative
 
 
-BACK_ENDS = {"native": (torch.float32, 1e-4), "reference": (torch.float64, 1e-6)}
+TOLERANCE = 1e-4
 
 
-@pytest.mark.parametrize("back_end", BACK_ENDS)
-def test_interpolation_moves_with_the_vertices(scene: Scene, back_end: str):
+def test_interpolation_moves_with_the_vertices(scene: Scene):
     attributes, weights = torch.rand(len(scene.points), 2).double(), loss_weights((36, 40, 2))
-    dtype, tolerance = BACK_ENDS[back_end]
 
     def reference(points: Tensor) -> Tensor:
         seen = replace(scene.fragments, barycentric=barycentrics_reference(scene.fragments, points, scene.faces))
         return (interpolate_reference(seen, attributes, scene.faces) * weights).sum()
 
-    def native(points: Tensor) -> Tensor:
+    def function(points: Tensor) -> Tensor:
         seen = differentiable_fragments(scene.fragments, points, scene.faces)
         return (interpolate(seen, attributes.float(), scene.faces) * weights).sum()
 
-    function, points = native if back_end == "native" else reference, scene.points.to(dtype)
-    assert_close(function(points), reference(scene.points.double()), 1e-5)
-    assert_close(gradient(function, points), finite_difference(reference, scene.points, 1e-7), tolerance)
+    assert_close(function(scene.points), reference(scene.points.double()), 1e-5)
+    assert_close(gradient(function, scene.points), finite_difference(reference, scene.points, 1e-7), TOLERANCE)
     exact = barycentrics_reference(scene.fragments, scene.points.double(), scene.faces)
     torch.testing.assert_close(exact.float(), scene.fragments.barycentric, atol=2e-4, rtol=0)
 
 
-@pytest.mark.parametrize("back_end", BACK_ENDS)
-def test_texture_lookup_has_both_gradients(back_end: str):
+def test_texture_lookup_has_both_gradients():
     random, weights = torch.Generator().manual_seed(1), loss_weights((9, 4, 3))
-    dtype, tolerance = BACK_ENDS[back_end]
-    texture = torch.rand(5, 7, 3, generator=random).to(dtype)
-    uv = (torch.rand(9, 4, 2, generator=random) * 1.2 - 0.1).to(dtype)  # also beyond the borders
-
-    def own(texture: Tensor, uv: Tensor) -> Tensor:
-        return (sample_texture if back_end == "native" else sample_texture_reference)(texture, uv)
+    texture = torch.rand(5, 7, 3, generator=random)
+    uv = torch.rand(9, 4, 2, generator=random) * 1.2 - 0.1  # also beyond the borders
 
     def exact(texture: Tensor, uv: Tensor) -> Tensor:
         return (sample_texture_reference(texture.double(), uv.double()) * weights).sum()
 
     expected = sample_texture_reference(texture.double(), uv.double())
-    torch.testing.assert_close(own(texture, uv).double(), expected, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(sample_texture(texture, uv).double(), expected, atol=1e-6, rtol=1e-6)
     by_texture = finite_difference(lambda value: exact(value, uv), texture, 1e-3)
     by_uv = finite_difference(lambda value: exact(texture, value), uv, 1e-7)
-    assert_close(gradient(lambda value: (own(value, uv) * weights).sum(), texture), by_texture, tolerance)
-    assert_close(gradient(lambda value: (own(texture, value) * weights).sum(), uv), by_uv, 10 * tolerance)
+    assert_close(gradient(lambda value: (sample_texture(value, uv) * weights).sum(), texture), by_texture, TOLERANCE)
+    assert_close(gradient(lambda value: (sample_texture(texture, value) * weights).sum(), uv), by_uv, 10 * TOLERANCE)
 
 
-@pytest.mark.parametrize("back_end", BACK_ENDS)
-def test_antialiasing_moves_with_silhouettes(scene: Scene, back_end: str):
+def test_antialiasing_moves_with_silhouettes(scene: Scene):
     image, weights = torch.rand(36, 40, 3, generator=torch.Generator().manual_seed(2)), loss_weights((36, 40, 3))
-    dtype, tolerance = BACK_ENDS[back_end]
-    function = antialias if back_end == "native" else antialias_reference
+    points = scene.points
 
     def draw(function: Callable[..., Tensor], image: Tensor, points: Tensor) -> Tensor:
         return function(image, scene.fragments, points, scene.faces, scene.edges)
@@ -143,19 +128,17 @@ def test_antialiasing_moves_with_silhouettes(scene: Scene, back_end: str):
     def exact(image: Tensor, points: Tensor) -> Tensor:
         return (draw(antialias_reference, image.double(), points.double()) * weights).sum()
 
-    expected = draw(antialias_reference, image.double(), scene.points.double())
+    expected = draw(antialias_reference, image.double(), points.double())
     assert ((expected - image).abs().sum(-1) > 1e-3).sum() > 80
-    image, points = image.to(dtype), scene.points.to(dtype)
-    torch.testing.assert_close(draw(function, image, points).double(), expected, atol=1e-5, rtol=0)
-    by_points = finite_difference(lambda value: exact(image, value), scene.points, 1e-7)
+    torch.testing.assert_close(draw(antialias, image, points).double(), expected, atol=1e-5, rtol=0)
+    by_points = finite_difference(lambda value: exact(image, value), points, 1e-7)
     by_image = gradient(lambda value: exact(value, points), image.double())
-    assert_close(gradient(lambda value: (draw(function, image, value) * weights).sum(), points), by_points, tolerance)
-    assert_close(gradient(lambda value: (draw(function, value, points) * weights).sum(), image), by_image, tolerance)
+    assert_close(gradient(lambda value: (draw(antialias, image, value) * weights).sum(), points), by_points, TOLERANCE)
+    assert_close(gradient(lambda value: (draw(antialias, value, points) * weights).sum(), image), by_image, TOLERANCE)
 
 
-@pytest.mark.parametrize("back_end", BACK_ENDS)
 @pytest.mark.parametrize("field", ["points", "normals", "texture", "light"])
-def test_loss_has_the_gradients_of_finite_differences(scene: Scene, back_end: str, field: str):
+def test_loss_has_the_gradients_of_finite_differences(scene: Scene, field: str):
     """And it draws the picture that it compares."""
     random = torch.Generator().manual_seed(4)
     used = torch.rand(len(scene.faces), generator=random) > 0.15
@@ -168,7 +151,7 @@ def test_loss_has_the_gradients_of_finite_differences(scene: Scene, back_end: st
         "texture": torch.rand(6, 5, 3, generator=random), "light": torch.rand(9, 3, generator=random),
     }  # fmt: skip
     target, mask = torch.rand(36, 40, 3, generator=random), torch.rand(36, 40, generator=random)
-    (dtype, tolerance), picture = BACK_ENDS[back_end], torch.empty(36, 40, 3)
+    picture = torch.empty(36, 40, 3)
 
     def exact(values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         values = {name: value.double() for name, value in values.items()}
@@ -178,16 +161,13 @@ def test_loss_has_the_gradients_of_finite_differences(scene: Scene, back_end: st
 
     def function(value: Tensor) -> Tensor:
         values = inputs | {field: value}
-        if back_end == "reference":
-            return exact(values)[0]
         return mesh_loss(scene.fragments, mesh=mesh, target=(target, mask, 0.05), picture=picture, **values)
 
     expected = finite_difference(lambda value: exact(inputs | {field: value})[0], inputs[field], 1e-6)
     loss, drawn = exact(inputs)
     assert abs(float(function(inputs[field])) - float(loss)) < 1e-6
-    if back_end == "native":
-        torch.testing.assert_close(picture.double(), drawn, atol=1e-4, rtol=0)
-    assert_close(gradient(function, inputs[field].to(dtype)), expected, tolerance)
+    torch.testing.assert_close(picture.double(), drawn, atol=1e-4, rtol=0)
+    assert_close(gradient(function, inputs[field]), expected, TOLERANCE)
 
 
 def test_edges_of_a_square():

@@ -97,7 +97,7 @@ def test_first_fifty_steps_lower_the_loss(method: str) -> None:
 @each
 def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: str, tmp_path: Path) -> None:
     undisturbed, data = started(CONFIGS[method])
-    store, written = undisturbed.avatar.gaussian_store(), 0
+    store, written = undisturbed.avatar.store, 0
     counts = {len(store)}
     while undisturbed.step < SETTINGS.steps:
         step(undisturbed, data, SETTINGS)
@@ -124,7 +124,7 @@ def test_training_goes_on_from_a_checkpoint_as_if_it_had_never_stopped(method: s
 def test_saved_avatar_renders_the_same_picture(method: str, tmp_path: Path) -> None:
     avatar = new_avatar(method, disturbed=True)
     if avatar.density() is not None:
-        avatar.gaussian_store().append(torch.arange(7))
+        avatar.store.append(torch.arange(7))
     write_avatar(tmp_path / "avatar", avatar)
     avatar.eval()  # as a loaded one is: a method may then pose its baked form
     for folder in (tmp_path, tmp_path / "avatar"):

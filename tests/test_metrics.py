@@ -10,13 +10,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from mien import perceptual
 from mien.cli import main
 from mien.disk.files import read_json
 from mien.evaluation import scoring
 from mien.evaluation.metrics import MAX_PSNR, Windows, crop_to, l1, psnr, ssim, ssim_map
 from mien.media.pictures import error_heat, heat_colors, picture_grid, picture_uri, shrink, side_by_side, to_uint8
 from mien.media.source import read_image
-from mien.perceptual import distance, lpips, weights
+from mien.perceptual import distance, lpips
 from mien.perceptual.distance import load_perceptual
 from refusals import complaint, refuses
 
@@ -82,10 +83,10 @@ def test_first_map_in_one_step_equals_two(size: tuple[int, int]) -> None:
 
 def test_missing_and_damaged_weights_are_the_users_to_mend(monkeypatch, tmp_path) -> None:
     load_perceptual.cache_clear()
-    monkeypatch.setattr(weights, "PACKAGE", "no_such_package_here")
+    monkeypatch.setattr(perceptual, "PACKAGE", "no_such_package_here")
     refuses("pip install stlpips-pytorch", load_perceptual)
     path = tmp_path / "alex.pth"
-    monkeypatch.setattr(weights, "weights_path", lambda backbone: path)
+    monkeypatch.setattr(perceptual, "weights_path", lambda backbone: path)
     for content, words in (
         (None, "missing"), (b"no weights", "damaged"), ({"scaling_layer.shift": torch.zeros(1)}, "damaged"),
     ):  # fmt: skip

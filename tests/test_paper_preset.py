@@ -243,7 +243,7 @@ def test_extent_is_that_of_the_training_cameras_and_reaches_rates_in_its_unit_on
         for width in (1.0, 3.0):
             torch.manual_seed(0)
             avatar = GaussianAvatars(config, toy_face_model(), toy_face(5))
-            store = avatar.gaussian_store()
+            store = avatar.store
             (store["means"].sum() + store["log_scales"].sum()).backward()
             Adam().step(avatar.parameter_groups(), Progress(0, 10, extent=width))
             moved.append([float(store[name].detach().abs().max()) for name in ("means", "log_scales")])

@@ -17,8 +17,8 @@ from mien.camera import Box
 from mien.errors import UserError
 from mien.face import FaceModel
 from mien.gaussians import Rendering
+from mien.perceptual import weights_path
 from mien.perceptual.features import load_training_features
-from mien.perceptual.weights import weights_path
 from mien.training import train
 from mien.training.footage.frames import CROP, random_at
 from mien.training.footage.sequence import Sequence, Target, Targets

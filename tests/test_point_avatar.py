@@ -17,7 +17,7 @@ from mien.face import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
 from mien.render import rasterize
-from mien.render.closing import close_holes
+from mien.render.rasterize import close_holes
 from mien.training import PRESETS
 from plain_settings import plain_point_avatar
 from refusals import refuses

@@ -86,7 +86,7 @@ def moved_avatar(method: str) -> Avatar:
     if method == "headgas":
         torch.manual_seed(0)
         avatar: Avatar = HeadGas(HeadGasConfig(points=50, directions=3), toy_face_model(), toy_face(5))
-        avatar.gaussian_store().assign("bases", torch.randn(avatar.gaussian_store()["bases"].shape))
+        avatar.store.assign("bases", torch.randn(avatar.store["bases"].shape))
     else:
         avatar = new_avatar()
     generator = torch.Generator().manual_seed(1)
@@ -121,9 +121,9 @@ def test_the_baked_form_is_what_the_networks_give(method: str, tmp_path: Path) -
     assert torch.equal(loaded.pose(face).gaussians.sh, avatar.pose(face).gaussians.sh)
     assert difference(loaded, face) < 1e-5
     with torch.no_grad():
-        avatar.gaussian_store()["means"].mul_(0.9)
+        avatar.store["means"].mul_(0.9)
     assert difference(avatar, face) < 1e-5
-    avatar.gaussian_store().select(torch.arange(3))
+    avatar.store.select(torch.arange(3))
     assert avatar.pose(face).gaussians.means.shape == (5, 3, 3)
 
 

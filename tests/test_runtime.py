@@ -95,9 +95,9 @@ def test_the_features_network_equals_its_reference_in_numpy_and_has_directions_t
     along = network.along
     assert along is not None
     for wrong, part in (
-        (replace(along, rest=along.rest[1:], directions=along.directions[1:]), "the shape of rest of its directions"),
+        (replace(along, rest=along.rest[1:], directions=along.directions[1:]), "along.rest has the shape"),
         (replace(along, basis=np.repeat(along.basis, 9, 2)), "288 features, but"),
-        (replace(along, basis=along.basis[1:]), "the shape of basis of its directions"),
+        (replace(along, basis=along.basis[1:]), "along.basis has the shape"),
         (None, "the input features, which does not fit its directions"),
     ):
         baked = replace(whole.baked, network=replace(network, along=wrong))
@@ -115,8 +115,8 @@ def test_files_with_other_content_are_told(tmp_path: Path) -> None:
     for wrong, part in (
         (replace(whole, neutral=replace(whole.neutral, expression=nan)), "NaN"),
         (replace(whole, baked=replace(bound, face_index=bound.face_index + 10**6)), "that does not exist"),
-        (replace(whole, expression_names=("drop",)), "1 expression names"),
-        (replace(whole, joint_names=()), "0 joint names"),
+        (replace(whole, expression_names=("drop",)), "name different expressions"),
+        (replace(whole, joint_names=()), "name different expressions or joints"),
         (replace(whole, baked=replace(bound, rig=replace(bound.rig, joint_parents=(2, 0, 0)))), "before its parent"),
         (replace(whole, baked=replace(bound, rig=many)), "300 expressions and 1 free joints, more than can be posed"),
     ):
@@ -178,7 +178,7 @@ def talking_face(model: FaceModel) -> FaceParams:
 def grown_avatar(model: FaceModel, face: FaceParams, config: MethodConfig, count: int) -> Avatar:
     """Return an avatar as training leaves it: several Gaussians per triangle, small, coloured, mostly opaque."""
     avatar = METHODS[DEFAULT_METHOD].avatar(config, model, face)
-    store = avatar.gaussian_store()
+    store = avatar.store
     store.append(torch.arange(count - len(store)) % len(store))
     store.assign("means", 0.3 * noise(7, count, 3))
     store.assign("quats", noise(8, count, 4))
@@ -223,7 +223,7 @@ def test_every_pixel_equals_that_of_training(colors: dict[str, Any], tmp_path: P
     model, camera = load_face_model("anny"), view(WIDE)
     face = talking_face(model)
     avatar = grown_avatar(model, face, plain_config(DEFAULT_METHOD, **colors), GAUSSIANS)
-    assert len(avatar.gaussian_store()) == GAUSSIANS
+    assert len(avatar.store) == GAUSSIANS
     expected = rasterize(avatar.pose(face).gaussians, [camera] * TIMESTEPS, torch.ones(3))
     found = rendered_without_torch(avatar, face, camera, tmp_path)
     assert found["image"].shape == (TIMESTEPS, WIDE, WIDE, 3)

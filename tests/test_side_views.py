@@ -134,7 +134,7 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     assert float(turned) == 0
     # The random numbers raise coefficients until the activations, 2 alike, have the length that they approach.
     assert 0 < float(raised) <= 8 * 3 * 2 * 1.1**2
-    surface = known(avatar.surface())
+    surface = known(avatar.extras.surface)
     hair = ~views.compared[surface.triangles()]
     assert 0.1 < float(hair.float().mean()) < 0.9
     kept = torch.where(hair[:, None, None], 0.0, avatar.store["offset_basis"])

@@ -10,7 +10,7 @@ from torch import Tensor
 from known import known
 from mien.avatar.avatar import move_avatar
 from mien.avatar.settings import Progress
-from mien.avatar.textured_mesh.avatar import TexturedMesh
+from mien.avatar.textured_mesh.avatar import OVERLAP, TexturedMesh
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
 from mien.face import FaceModel, FaceParams
@@ -19,7 +19,6 @@ from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
 from mono_avatars import pictured
 from plain_settings import plain_textured_mesh
-from refusals import refuses
 from toy_scene import rgb_from_sh, toy_camera, toy_face, toy_face_model
 
 PLAIN = plain_textured_mesh()
@@ -82,7 +81,7 @@ def test_surfels_cover_equal_areas_and_follow_offsets_exactly() -> None:
     torch.testing.assert_close(posed.gaussians.means[0], surfels.at_corners(corners), atol=1e-6, rtol=0)
     # A surfel's covariance is that of its part of the triangle, twice and a half as wide along each axis.
     parts = (corners - corners.mean(1, keepdim=True))[bound] * surfels.shares()[:, None, None]
-    expected = PLAIN.overlap**2 * parts.transpose(1, 2) @ parts / 12
+    expected = OVERLAP**2 * parts.transpose(1, 2) @ parts / 12
     turns, scales = matrix_from_quaternion(posed.gaussians.quats[0]), posed.gaussians.scales[0]
     found = turns @ torch.diag_embed((scales * torch.tensor([1, 0, 1])) ** 2) @ turns.transpose(1, 2)
     torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
@@ -115,8 +114,6 @@ def test_surfels_cover_the_mesh(surfels: int, least: float) -> None:
     stretched, _ = picture(avatar)
     assert stretched.sum() > 1.2 * alpha.sum()
     assert stretched[inside].min() > least - 0.01
-    narrow, inside = picture(new_avatar(replace(config, overlap=1.2), plane_model()))
-    assert narrow[inside].min() < 0.9
 
 
 def test_teeth_and_eyes_stay_and_offsets_and_colours_are_averaged_over_neighbours() -> None:
@@ -160,30 +157,13 @@ def test_a_color_is_albedo_times_light_on_the_normal_in_the_frame_of_the_light()
     x, z = 0.6 * edges[:, 0] / edges.norm(dim=1), 0.8
     expected = torch.stack([0.25 * (1 + z + 0 * x), 0.5 * (1 + x), 0.75 * (3 * z**2 - 1) + 0 * x], dim=-1)
     torch.testing.assert_close(colors(avatar, at_rest(avatar)), expected)
-    turn = torch.tensor([[0.0, math.pi / 2, 0.0]])
-    for light in ("head", "world"):
-        avatar = new_avatar(replace(PLAIN, light=light), plane_model())
-        with torch.no_grad():
-            avatar.light[2:4] = torch.tensor([[1.0, 0, 0], [0, 1, 0]])
-        still = at_rest(avatar)
-        names = ("expression", "joints", "head_translation")
-        twice = {name: getattr(still, name).expand(2, *getattr(still, name).shape[1:]) for name in names}
-        before, after = colors(avatar, replace(still, head_rotation=torch.cat([0 * turn, turn]), **twice)).expand(
-            2, -1, 3
-        )
-        torch.testing.assert_close(colors(avatar, still).expand(1, -1, 3)[0], before)
-        assert before[..., 0].min() > 0.6
-        if light == "head":
-            assert torch.equal(after, before)
-            continue
-        # The sheet looks along +x now, where the first channel has no lamp and the second has one.
-        torch.testing.assert_close(after[..., [1, 0]], before[..., [0, 1]], atol=1e-5, rtol=0)
-        refuses(r"^the setting light world of textured_mesh: .*export a \.ply", avatar.bake)
+    # A head that turns keeps its colours: the light is that of the face at rest.
+    turned = replace(at_rest(avatar), head_rotation=torch.tensor([[0.0, math.pi / 2, 0.0]]))
+    torch.testing.assert_close(colors(avatar, turned), expected)
 
 
-@pytest.mark.parametrize("light", ["head", "world"])
-def test_gradients_are_those_of_finite_differences(light: str) -> None:
-    avatar = new_avatar(replace(PLAIN, light=light), disturbed=0.3)
+def test_gradients_are_those_of_finite_differences() -> None:
+    avatar = new_avatar(disturbed=0.3)
     double = torch.zeros((), dtype=torch.float64)
     move_avatar(avatar, double)
     face, some_picture = toy_face(5)[1].to(double), pictured(len(avatar.store))
@@ -216,9 +196,9 @@ def test_penalties_are_of_rough_offsets_and_albedo_and_of_bent_normals_and_of_li
     detail, slopes = (store[name].square().sum() / len(store) for name in ("albedo", "slopes"))
     white = torch.tensor([math.sqrt(4 * math.pi), *[0.0] * 8])[:, None]
     expected = {
-        "offsets": PLAIN.offset_weight * rough[0],
-        "albedo": PLAIN.albedo_weight * (rough[1] + detail),
-        "normals": PLAIN.normal_weight * slopes,
-        "light": PLAIN.light_weight * (avatar.light - white).square().mean(),
+        "offsets": 0.02 * rough[0],
+        "albedo": 0.003 * (rough[1] + detail),
+        "normals": 0.01 * slopes,
+        "light": 0.01 * (avatar.light - white).square().mean(),
     }
     torch.testing.assert_close(losses, expected)

@@ -49,7 +49,7 @@ def pull_at(state: TrainingState, data: TrainingData, frame: int) -> torch.Tenso
 
 
 def means_moments(state: TrainingState) -> Moments:
-    moments = state.avatar.gaussian_store().moments["means"]
+    moments = state.avatar.store.moments["means"]
     assert isinstance(moments, Moments)
     return moments
 
@@ -92,7 +92,7 @@ def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: py
     assert state.curves["step"] == [8, 12, 16, 20, 28, 30]
     # No round of density control is left out: those after 5, 10, .., 25 frames.
     assert rounds == [False, True, True, True, True, False, True, False]
-    assert len(state.avatar.gaussian_store()) == 120
+    assert len(state.avatar.store) == 120
 
 
 def test_a_timestep_that_comes_twice_is_updated_once() -> None:
@@ -105,7 +105,7 @@ def test_a_timestep_that_comes_twice_is_updated_once() -> None:
 def test_many_points_mean_fewer_frames() -> None:
     """Other methods use one frame."""
     state, _ = new_state(replace(SMALL, frames_per_step=8, points_per_step=200))
-    store, found = state.avatar.gaussian_store(), []
+    store, found = state.avatar.store, []
     for count in (20, 25, 26, 60, 100, 101, 200, 500):
         store.select(torch.arange(count) % len(store))
         found.append(state.avatar.extras.frames_per_step())
@@ -130,7 +130,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 
 def test_views_with_their_own_backgrounds_and_sizes_are_drawn_as_alone() -> None:
     avatar, cameras = new_avatar("mono_gaussian_avatar"), [toy_camera(24), toy_camera(40)]
-    backgrounds, means = [torch.ones(3), torch.tensor([0.1, 0.5, 0.9])], avatar.gaussian_store()["means"]
+    backgrounds, means = [torch.ones(3), torch.tensor([0.1, 0.5, 0.9])], avatar.store["means"]
 
     def drawn(together: bool) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
         own = avatar.pose(toy_face(2), Progress(0, 10)).gaussians.timesteps()

@@ -143,7 +143,7 @@ def test_threads_do_not_change_a_bit() -> None:
         state, data = training_case(load_face_model(), 6000, 128, 160)
         for _ in range(3):
             step(state, data, BENCHMARK_SETTINGS)
-        store = state.avatar.gaussian_store()
+        store = state.avatar.store
         tensors = {name: store[name].detach().clone() for name in store.names()}
         tensors |= {f"{name}.second": moments.second for name, moments in store.moments.items()}
         assert state.density is not None

@@ -127,7 +127,7 @@ def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequen
 
 
 def surface_of(avatar: Avatar) -> BoundSurface:
-    surface = avatar.surface()
+    surface = avatar.extras.surface
     assert surface is not None
     return surface
 

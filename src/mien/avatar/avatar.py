@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import final
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -107,13 +106,13 @@ class Extras:
     """Properties that only some methods have. The defaults are those of most methods."""
 
     surface: BoundSurface | None = None
-    """The surface that the Gaussians are bound to."""
+    """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
     frames_per_step: Callable[[], int] = lambda: 1
     """Returns the number of training frames that the next optimiser step uses."""
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
     closing: int = 0
-    """Pixels by which finished pictures are eroded and then dilated (`mien.render.close_holes`)."""
+    """Pixels by which finished pictures are eroded and then dilated (`close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
 
@@ -161,16 +160,6 @@ class Avatar(nn.Module, ABC):
     @abstractmethod
     def bake(self) -> BakedAvatar:
         """The avatar as a record of `mien.runtime`, which works without torch and this class: for files and engines."""
-
-    @final
-    def gaussian_store(self) -> GaussianStore:
-        """The store that holds every per-Gaussian tensor."""
-        return self.store
-
-    @final
-    def surface(self) -> BoundSurface | None:
-        """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
-        return self.extras.surface
 
 
 def move_avatar(avatar: Avatar, like: Tensor) -> None:

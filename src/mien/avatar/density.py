@@ -58,10 +58,6 @@ class RefillDensity:
     refill: Callable[[GaussianStore, Int[Tensor, " p"], Float[Tensor, "p 3"], float], Mapping[str, Tensor]]
     """(store, parents, noise uniform in -0.5..0.5, fraction of the run) -> tensors, by name, in which children differ
     from their parents."""
-    judged_opacities: Callable[[GaussianStore, Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
-    """(store, highest opacity of each Gaussian since the last round) -> the opacity to prune by. None: the latter."""
-    may_prune: Callable[[GaussianStore, Bool[Tensor, " n"]], Bool[Tensor, " n"]] | None = None
-    """(store, prunes requested) -> prunes allowed. None: all."""
     observed: Callable[[Gaussians, Rendering], Float[Tensor, " n"]] | None = None
     """(Gaussians of a step, their picture after the backward pass) -> how visible each Gaussian is, 0..1, in the place
     of its opacity."""

@@ -51,7 +51,7 @@ def write_avatar(folder: Path, avatar: Avatar) -> None:
     content = _Content(
         kind=method_of(avatar.config),
         config=encode(avatar.config),
-        gaussians=len(avatar.gaussian_store()),
+        gaussians=len(avatar.store),
         face_model=avatar.face_model.name,
         face_model_hash=avatar.face_model.content_hash,
         face_model_carried=carried,
@@ -121,7 +121,7 @@ def overwrite(avatar: Avatar, state: dict[str, Tensor], gaussians: int, source: 
     """Replace every tensor of an avatar. The number of Gaussians may change. A record of it must be possible."""
     with expect_whole(source, "train it again"):
         _check_fits(avatar.state_dict(), state, gaussians)
-        avatar.gaussian_store().resize(gaussians)
+        avatar.store.resize(gaussians)
         avatar.load_state_dict(state)
         # A few avatars have no record, and only drawing them can tell.
         fault = baked_fault(avatar.bake()) if avatar.extras.unbaked is None else None

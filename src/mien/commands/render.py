@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -16,7 +16,6 @@ from mien.pipeline.picture_options import PictureOptions
 
 if TYPE_CHECKING:
     import numpy
-    import torch
 
     import mien.avatar
     import mien.camera
@@ -142,7 +141,7 @@ class Render(_Look):
         pictures = (picture(index) for index in range(len(cameras)))
         shown = pictures if output.kind == "still" else track_progress(pictures, "Rendering", len(cameras))
         write_pictures(output, shown, self.fps)
-        count, first = len(avatar.gaussian_store()), cameras[0]
+        count, first = len(avatar.store), cameras[0]
         say(f"{self.out}: {count:,} Gaussians at {first.width}x{first.height}, frames: {len(cameras)}")
         if sides is not None:
             say(sides)
@@ -161,12 +160,12 @@ class Render(_Look):
     ) -> "list[mien.camera.Camera]":
         """The camera of each frame."""
         from mien.pipeline.draw import posed_softly, whole
-        from mien.render import camera_paths
+        from mien.render.camera_paths import read_cameras, turned_camera
         from mien.tracking.files import read_tracking
         from mien.training.run import run_camera
 
         if self._is_listed():
-            cameras = camera_paths.read_cameras(Path(self.path))
+            cameras = read_cameras(Path(self.path))
             if timesteps is not None and len(cameras) < timesteps:
                 raise UserError(f"{self.path}: has {len(cameras)} cameras for {timesteps} timesteps; give one for each")
             if any((c.width, c.height) != (cameras[0].width, cameras[0].height) for c in cameras):
@@ -184,29 +183,33 @@ class Render(_Look):
             first = run_camera(run_dir).fitted(*self.picture.shape(), self.zoom or 1.0)
             first = self.turned(first, avatar.subject)
             first = whole(first, posed_softly(avatar)(face[0])) if self.zoom is None else first
-            return self._moved(camera_paths, first, avatar.subject.head_translation[0], self._frames(timesteps))
+            center = avatar.subject.head_translation[0]
+            return [turned_camera(first, center, *angles) for angles in self._angles(self._frames(timesteps))]
         return [self.turned(camera, avatar.subject) for camera in cameras] if self.yaw or self.pitch else cameras
 
     def _draw_file(self) -> None:
         """Draw the avatar of a file, without torch."""
         from mien.pipeline.draw_file import render_file
-        from mien.runtime import camera_paths
+        from mien.runtime.camera_paths import turned
 
         frames = self._frames(None)
+        angles = self._angles(frames)
         render_file(
             self.workspace, self.picture.plan(self.out, frames), self.picture, self.set, self.yaw, self.pitch,
-            self.zoom, lambda camera, center: self._moved(camera_paths, camera, center, frames), self.fps,
+            self.zoom, lambda camera, at: [turned(camera, at, *each) for each in angles], self.fps,
         )  # fmt: skip
 
-    def _moved(self, paths: Any, camera: Any, center: "numpy.ndarray | torch.Tensor", frames: int) -> list[Any]:
-        """The cameras of --path, by the module that moves cameras of this type."""
+    def _angles(self, frames: int) -> list[tuple[float, float]]:
+        """Yaw and pitch of the camera of --path in each frame, in radians."""
+        from mien.runtime.camera_paths import sway, turntable
+
         span = math.radians(self.span)
         if self.path == "still" or self._is_still():
-            return [camera] * frames
+            return [(0.0, 0.0)] * frames
         if self.path == "turntable":
-            return paths.turntable(camera, center, frames, span)
+            return turntable(frames, span)
         tilt = math.radians(15)  # up and down
-        return paths.sway(camera, center, frames, span, tilt, crossing=self.path == "sway")
+        return sway(frames, span, tilt, crossing=self.path == "sway")
 
     def _is_listed(self) -> bool:
         """Whether the cameras come from a file."""
@@ -283,7 +286,7 @@ class Sheet(_Look):
             tiles = sheets.nearer_tiles(tiles, picture, (red, green, blue))
         output = self.picture.plan(self._output, 1)
         write_pictures(output, [sheets.draw_sheet(tiles, picture, (red, green, blue))], 25.0)
-        say(f"{self._output}: {len(tiles)} pictures of {len(avatar.gaussian_store()):,} Gaussians")
+        say(f"{self._output}: {len(tiles)} pictures of {len(avatar.store):,} Gaussians")
         if sides is not None:
             say(sides)
 

@@ -15,7 +15,7 @@ from mien.face.head_parts import part_boxes
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, Rendering
 from mien.render import rasterize
-from mien.render.closing import close_holes
+from mien.render.rasterize import close_holes
 from mien.render.validation import drawable
 from mien.tracking.scoring import Scoring
 from mien.training.colors import lit

@@ -20,9 +20,9 @@ from mien.face.head_parts import PARTS
 from mien.machine.threads import asked_threads
 from mien.media.pictures import to_uint8
 from mien.pages.pages import METRICS
+from mien.perceptual import Backbone
 from mien.perceptual.distance import MIN_SIDE, PerceptualDistance, load_perceptual
 from mien.perceptual.lpips import Lpips, load_lpips
-from mien.perceptual.weights import Backbone
 
 LPIPS = "lpips"
 """Exact LPIPS, which stands beside them if its user has the weights."""

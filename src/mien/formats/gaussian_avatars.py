@@ -113,7 +113,7 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
     for name, array in state.items():
         if not is_moderate(array):
             raise UserError(f"{path}: {name} holds NaN or numbers beyond {MAX_NUMBER:g}; export it again")
-    trained = {name: torch.from_numpy(state[name]) for name in avatar.gaussian_store().trained}
+    trained = {name: torch.from_numpy(state[name]) for name in avatar.store.trained}
     own = {key: trained.get(key.rpartition(".")[2], binding) for key in avatar.state_dict()}
     overwrite(avatar, own, len(binding), path)
     return GaussianAvatarsFolder(avatar, face)

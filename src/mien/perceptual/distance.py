@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mien.perceptual.weights import Backbone, build_from_weights
+from mien.perceptual import Backbone, build_from_weights
 
 _BLUR = torch.tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])[None, None] / 16
 _STRIP = 16

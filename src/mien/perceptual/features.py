@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
-from mien.perceptual.weights import build_from_weights
+from mien.perceptual import build_from_weights
 
 MAX_BLOCKS = 3
 """Number of the network's blocks that can be used. Deeper ones see too much of a small crop, and cost more."""

@@ -16,7 +16,7 @@ from mien.machine.progress import say
 from mien.media.pixels import to_rgb, to_rgba
 from mien.pipeline.picture_options import PictureOptions
 from mien.render import rasterize
-from mien.render.closing import close_holes
+from mien.render.rasterize import close_holes
 from mien.render.validation import drawable
 from mien.runtime.camera_paths import zoom_for_all
 from mien.training.footage.filmed import filmed_words, read_coverage
@@ -73,7 +73,7 @@ def warn_of_white(options: PictureOptions, run_dir: Path, avatar: Avatar) -> Non
         return
     settings = read_run_config(run_dir)["settings"]
     # `auto` is random where avatar and settings can fill sides.
-    may_fill = avatar.surface() is not None and settings.get("unseen") != "trained"
+    may_fill = avatar.extras.surface is not None and settings.get("unseen") != "trained"
     if settings.get("background") == "white" or (settings.get("background") == "auto" and not may_fill):
         say(
             "warning: this avatar was trained over white, so bright skin and outlines may be partly transparent; "

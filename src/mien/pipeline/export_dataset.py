@@ -36,7 +36,7 @@ from mien.media.pictures import to_uint8
 from mien.media.video import write_video
 from mien.pipeline.train import fill_in_split, read_together
 from mien.render import rasterize
-from mien.render.closing import close_holes
+from mien.render.rasterize import close_holes
 from mien.render.validation import drawable
 from mien.tracking.files import read_tracking
 from mien.training.run import check_data, read_face_track, read_run_config

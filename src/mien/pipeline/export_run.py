@@ -42,7 +42,7 @@ class RunContent(Content):
     @property
     def count(self) -> int:
         """Number of Gaussians."""
-        return len(self._avatar.gaussian_store())
+        return len(self._avatar.store)
 
     def portable(self, confidence: bool = True, soft_cut: bool = False) -> PortableAvatar:
         """Return the whole avatar, with everything that the run knows of it."""

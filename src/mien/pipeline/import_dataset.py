@@ -61,7 +61,7 @@ def run_import_stage(
             except BaseException:
                 remove_tree(run_dir)
                 raise
-        count = counted(len(avatar.gaussian_store()), "Gaussian")
+        count = counted(len(avatar.store), "Gaussian")
         say(f"{run_dir}: {count} on {avatar.face_model.name}, {counted(len(face), 'timestep')}")
         return
     if not corrects_colors:

@@ -1,8 +1,6 @@
-"""Camera paths around a head, and camera paths in files."""
+"""Cameras around a head, and camera paths in files. `mien.runtime.camera_paths` has the angles of paths."""
 
-import math
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera
-from mien.disk.files import read_json, write_json
+from mien.disk.files import read_json
 from mien.disk.limits import camera_fault
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
@@ -22,7 +20,6 @@ FORMAT, VERSION = "mien.cameras", 1
 _MAX_CAMERAS = 50_000
 """Most cameras of a file: half an hour at 30 frames a second."""
 _MAX_FOREIGN_BYTES = 32 << 20
-_WORLD_UP = (0.0, 1.0, 0.0)
 _DISTORTION = re.compile(
     r"dist(?!ance)|fisheye|radial|tangential|coef|^([kp][1-6]|s[1-4]|tau[xy12]|d|kc|xi|rd)$", re.IGNORECASE
 )
@@ -35,64 +32,11 @@ _OTHER_MODELS = re.compile(
 """Models of lenses that are neither an ideal lens nor OpenCV's usual model."""
 
 
-def turntable(
-    camera: Camera,
-    center: Float[Tensor, " 3"],
-    frames: int,
-    span: float = 2 * math.pi,
-    up: tuple[float, float, float] = _WORLD_UP,
-) -> list[Camera]:
-    """Cameras that circle `center` once at the distance, height and focal length of `camera`, which is the first.
-
-    If `span` is below a full turn, the camera swings instead: to span / 2 on the subject's left, back through the
-    middle to the right, and home. It slows down at the ends. Either path loops.
-
-    Args:
-        camera: The start of the path. The centre keeps its place in the picture.
-        center: The point to circle, in world space, in metres (the head's: `FaceParams.head_translation`).
-        frames: Number of cameras.
-        span: Angle in radians, 2 pi for a full turn.
-        up: Axis of the turn in world space.
-    """
-    phases = [2 * math.pi * index / frames for index in range(frames)]
-    full = span >= 2 * math.pi
-    return [orbit(camera, center, phase if full else 0.5 * span * math.sin(phase), up) for phase in phases]
-
-
 def turned_camera(camera: Camera, center: Float[Tensor, " 3"], yaw: float, pitch: float) -> Camera:
     """`camera` moved around `center`: first up by `pitch`, then to the subject's left by `yaw`, both in radians."""
     sideways = invert_rigid(camera.viewmat)[:3, 0]
     raised = orbit(camera, center, -pitch, tuple(sideways.tolist())) if pitch else camera
     return orbit(raised, center, yaw) if yaw else raised
-
-
-def sway(
-    camera: Camera, center: Float[Tensor, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
-) -> list[Camera]:
-    """Cameras on a horizontal figure eight around the position of `camera`, or on an oval without `crossing`.
-
-    Args:
-        camera: The middle of the path. The centre keeps its place in the picture.
-        center: The point to look at, in world space, in metres.
-        frames: Number of cameras. The path loops.
-        span: Angle from the far left to the far right, in radians.
-        tilt: Angle from the highest to the lowest point, in radians.
-        crossing: Whether the path is a figure eight.
-    """
-    views = []
-    for phase in (2 * math.pi * index / frames for index in range(frames)):
-        raised = 0.5 * tilt * (math.sin(2 * phase) if crossing else math.cos(phase))
-        views.append(turned_camera(camera, center, 0.5 * span * math.sin(phase), raised))
-    return views
-
-
-def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
-    """Write cameras in the format that `read_cameras` reads."""
-    listed = [
-        {"K": camera.K.tolist(), "viewmat": camera.viewmat.tolist(), "width": camera.width, "height": camera.height}
-        for camera in cameras
-    ]
-    write_json(path, FORMAT, VERSION, {"cameras": listed})
 
 
 def read_cameras(path: Path) -> list[Camera]:
@@ -187,9 +131,7 @@ def _whole(size: Any) -> Any:
     return int(size) if isinstance(size, float) and size.is_integer() else size
 
 
-def orbit(
-    camera: Camera, center: Float[Tensor, " 3"], angle: float, up: tuple[float, float, float] = _WORLD_UP
-) -> Camera:
+def orbit(camera: Camera, center: Float[Tensor, " 3"], angle: float, up: tuple[float, ...] = (0.0, 1.0, 0.0)) -> Camera:
     """`camera` moved around `center` by `angle` radians, counter-clockwise seen from above."""
     axis = torch.nn.functional.normalize(camera.viewmat.new_tensor(up), dim=0)
     turn = matrix_from_axis_angle(axis * angle)

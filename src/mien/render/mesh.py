@@ -6,15 +6,16 @@ vertices. Everything runs on one CPU thread and releases the GIL, so several Pyt
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample, normalize
 
 from mien import _native
 from mien.camera import Camera
-from mien.render.mesh_functions import interpolate_rows, look_up_texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,31 @@ def interpolate(
         attributes = attributes.flatten(0, 1)
     if attributes.dtype != torch.float32:
         return interpolate_reference(fragments, attributes, corners)
-    return interpolate_rows(attributes, fragments.barycentric, fragments.face_index, corners.contiguous())
+    rows = (attributes, fragments.barycentric, fragments.face_index, corners.contiguous())
+    return _Interpolate.apply(*rows)  # pyright: ignore[reportReturnType]
+
+
+class _Interpolate(torch.autograd.Function):
+    """Rows of attributes mixed by barycentrics."""
+
+    @staticmethod
+    def forward(ctx: Any, attributes: Tensor, barycentric: Tensor, face_index: Tensor, corners: Tensor):
+        attributes, barycentric = attributes.detach().contiguous(), barycentric.detach()
+        out = torch.empty(*face_index.shape, attributes.shape[1])
+        _native.interpolate_mesh(face_index, barycentric, attributes, corners, out)
+        ctx.save_for_backward(attributes, barycentric, face_index, corners)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        attributes, barycentric, face_index, corners = ctx.saved_tensors
+        grad_attributes = torch.zeros_like(attributes) if ctx.needs_input_grad[0] else None
+        grad_barycentric = torch.empty_like(barycentric) if ctx.needs_input_grad[1] else None
+        _native.interpolate_mesh_backward(
+            face_index, barycentric, attributes, corners, grad.contiguous(), grad_attributes, grad_barycentric
+        )
+        return grad_attributes, grad_barycentric, None, None
 
 
 def interpolate_reference(
@@ -109,7 +134,29 @@ def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"])
     The point (0, 0) is the lower left corner of the texture's picture, and v goes up. The result is differentiable in
     both arguments.
     """
-    return look_up_texture(texture, uv)
+    return _SampleTexture.apply(texture, uv)  # pyright: ignore[reportReturnType]
+
+
+class _SampleTexture(torch.autograd.Function):
+    """Bilinear texture look-up at any number of points."""
+
+    @staticmethod
+    def forward(ctx: Any, texture: Tensor, uv: Tensor):
+        texture, flat = texture.detach().contiguous(), uv.detach().reshape(-1, 2).contiguous()
+        out = torch.empty(len(flat), texture.shape[2])
+        _native.sample_texture(texture, flat, out)
+        ctx.save_for_backward(texture, flat)
+        return out.view(*uv.shape[:-1], -1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        texture, flat = ctx.saved_tensors
+        grad_texture = torch.zeros_like(texture) if ctx.needs_input_grad[0] else None
+        grad_uv = torch.empty_like(flat) if ctx.needs_input_grad[1] else None
+        rows = grad.reshape(len(flat), -1).contiguous()
+        _native.sample_texture_backward(texture, flat, rows, grad_texture, grad_uv)
+        return grad_texture, None if grad_uv is None else grad_uv.view(*grad.shape[:-1], 2)
 
 
 def sample_picture(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:

@@ -1,20 +1,22 @@
 """Gradients of pictures of meshes with respect to the mesh: through the visible surface and through silhouettes.
 
 There are single operations (`image_points`, `differentiable_fragments`, `interpolate`, `sample_texture`, `antialias`)
-and one that combines them with light and a robust loss in a single pass (`mesh_loss`). Each has a twin in plain PyTorch
-in `mien.render.mesh_reference`. They run on one thread, release the GIL, and are deterministic to the bit.
+and one that combines them with light and a robust loss in a single pass (`mesh_loss`). They run on one thread, release
+the GIL, and are deterministic to the bit.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from mien import _native
 from mien.camera import Camera
 from mien.render.mesh import MeshFragments
-from mien.render.mesh_functions import attach_barycentrics, blend_silhouettes, compare_picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +79,26 @@ def differentiable_fragments(
 
     Visibility and depth have no gradient, nor has a barycentric that was clamped at 0.
     """
-    barycentric = attach_barycentrics(fragments.barycentric, points, fragments.face_index, fragments.depth, faces)
-    return replace(fragments, barycentric=barycentric)
+    own = (fragments.barycentric, points, fragments.face_index, fragments.depth, faces)
+    return replace(fragments, barycentric=_Barycentrics.apply(*own))
+
+
+class _Barycentrics(torch.autograd.Function):
+    """The identity on barycentrics. The gradient goes to the image points that they were computed from."""
+
+    @staticmethod
+    def forward(ctx: Any, barycentric: Tensor, points: Tensor, face_index: Tensor, depth: Tensor, faces: Tensor):
+        ctx.save_for_backward(face_index, barycentric, depth, points.detach(), faces)
+        return barycentric.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        face_index, barycentric, depth, points, faces = ctx.saved_tensors
+        grad_points = torch.zeros(points.shape, dtype=torch.float64)
+        fragments = _native.Fragments(face_index, barycentric, depth)
+        _native.barycentric_backward(fragments, points, faces, grad.contiguous(), grad_points)
+        return None, grad_points.float(), None, None, None
 
 
 def antialias(
@@ -97,7 +117,33 @@ def antialias(
     outermost counts.
     """
     fixed = (fragments.face_index, fragments.barycentric.detach(), fragments.depth, faces)
-    return blend_silhouettes(image, points, *fixed, edges.vertices, edges.faces, edges.opposite)
+    fixed = (*fixed, edges.vertices, edges.faces, edges.opposite)
+    return _Antialias.apply(image, points, *fixed)  # pyright: ignore[reportReturnType]
+
+
+class _Antialias(torch.autograd.Function):
+    """A picture blended along the silhouettes of the mesh that it shows."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, points: Tensor, *mesh: Tensor):
+        *fragments, faces, edge_vertices, edge_faces, opposite = mesh
+        image, points = image.detach().contiguous(), points.detach()
+        out = torch.empty_like(image)
+        edges = _native.MeshEdges(edge_vertices, edge_faces, opposite)
+        _native.antialias(_native.Fragments(*fragments), points, faces, edges, image, out)
+        ctx.save_for_backward(image, points, *mesh)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        image, points, *fragments, faces, edge_vertices, edge_faces, opposite = ctx.saved_tensors
+        grad_image, grad_points = torch.empty_like(image), torch.zeros(points.shape, dtype=torch.float64)
+        edges = _native.MeshEdges(edge_vertices, edge_faces, opposite)
+        _native.antialias_backward(
+            _native.Fragments(*fragments), points, faces, edges, image, grad.contiguous(), grad_image, grad_points
+        )
+        return grad_image, grad_points.float(), *([None] * (len(ctx.saved_tensors) - 2))
 
 
 def mesh_loss(
@@ -131,4 +177,40 @@ def mesh_loss(
         fragments.face_index, fragments.barycentric.detach(), fragments.depth, mesh.faces, mesh.edges.vertices,
         mesh.edges.faces, mesh.edges.opposite, mesh.uv, mesh.face_weights,
     )  # fmt: skip
-    return compare_picture(points, normals, texture, light, constants, target, picture)
+    inputs = (points, normals, texture, light, constants, target, picture)
+    return _MeshLoss.apply(*inputs)  # pyright: ignore[reportReturnType]
+
+
+class _MeshLoss(torch.autograd.Function):
+    """`mesh_loss`. The forward pass computes the value and all gradients at once and keeps them for `backward`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, normals: Tensor, texture: Tensor, light: Tensor, mesh: tuple, target: tuple,
+        picture: Tensor | None,
+    ):  # fmt: skip
+        tensors = [tensor.detach().contiguous() for tensor in (points, normals, texture, light)]
+        face_index, barycentric, depth, faces, edge_vertices, edge_faces, opposite, uv, face_weights = mesh
+        grad_points = torch.zeros(points.shape, dtype=torch.float64)
+        grad_normals, grad_texture = torch.zeros(normals.shape), torch.zeros(texture.shape)
+        grad_light = torch.zeros(9, 3, dtype=torch.float64)
+        total, weight = _native.mesh_loss(
+            _native.Fragments(face_index, barycentric, depth),
+            tensors[0],
+            faces,
+            _native.MeshEdges(edge_vertices, edge_faces, opposite),
+            _native.LitSurface(tensors[1], uv, face_weights, tensors[2], tensors[3]),
+            _native.LossTarget(*target),
+            picture,
+            _native.LossGradients(grad_points, grad_normals, grad_texture, grad_light),
+        )
+        weight = max(weight, 1.0)
+        ctx.weight = weight
+        ctx.save_for_backward(grad_points.float(), grad_normals, grad_texture, grad_light.float())
+        return points.new_tensor(total / weight)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor):
+        scale = float(grad) / ctx.weight
+        return *(saved * scale for saved in ctx.saved_tensors), None, None, None

@@ -1,6 +1,6 @@
 """The function `rasterize` turns Gaussians and cameras into pictures. It chooses the back end and unrolls batches."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -17,29 +17,17 @@ from mien.render.validation import check_shapes
 from mien.rotation import compose_rigid
 
 Backend = Literal["auto", "native", "gsplat", "reference"]
-RenderView = Callable[[Gaussians, Camera, Tensor, Tensor], Rendering]
-"""Renders unbatched Gaussians, given in the camera's world, over a background, with offsets of the 2D centres."""
-RenderViews = Callable[[Sequence[View], Sequence[Tensor], Sequence[Tensor]], list[Rendering]]
-"""Renders several views, each with its own background and offsets."""
 
 
-def _one_by_one(render_view: RenderView) -> RenderViews:
-    def render_views(
-        views: Sequence[View], backgrounds: Sequence[Tensor], offsets: Sequence[Tensor]
-    ) -> list[Rendering]:
-        return [
-            render_view(*view, background, offset)
-            for view, background, offset in zip(views, backgrounds, offsets, strict=True)
-        ]
-
-    return render_views
-
-
-_BACKENDS: dict[str, RenderViews] = {
-    "native": render_native,
-    "gsplat": _one_by_one(render_gsplat),
-    "reference": _one_by_one(render_reference),
-}
+def _render(
+    backend: Backend, views: Sequence[View], backgrounds: Sequence[Tensor], offsets: Sequence[Tensor]
+) -> list[Rendering]:
+    """Render views of unbatched Gaussians, given in the camera's world, with offsets of their 2D centres."""
+    backend = choose_backend(views[0][0].means) if backend == "auto" else backend
+    if backend == "native":
+        return render_native(views, backgrounds, offsets)
+    render_view = {"gsplat": render_gsplat, "reference": render_reference}[backend]
+    return [render_view(*view, *more) for view, *more in zip(views, backgrounds, offsets, strict=True)]
 
 
 def rasterize(
@@ -68,9 +56,6 @@ def rasterize(
     if background is None:
         background = gaussians.means.new_zeros(3)
     check_shapes(gaussians, background)
-    render_views = _BACKENDS.get(choose_backend(gaussians.means) if backend == "auto" else backend)
-    if render_views is None:
-        raise ValueError(f"rasterize: unknown backend {backend!r}, expected auto, {', '.join(_BACKENDS)}")
     batch = _views(gaussians, camera)
     shape = (len(gaussians), 2) if batch is None else (len(batch), len(gaussians), 2)
     # An expanded zero needs no cleared memory, and its gradient is still a full tensor.
@@ -78,16 +63,16 @@ def rasterize(
     if batch is None:
         assert isinstance(camera, Camera)
         view = _in_local_frame(gaussians, camera)
-        picture = render_views([view], [background], [offset])[0]
-        return replace(picture, depth=_depths([view], [picture], render_views)[0]) if depth else picture
+        picture = _render(backend, [view], [background], [offset])[0]
+        return replace(picture, depth=_depths([view], [picture], backend)[0]) if depth else picture
     views = [_in_local_frame(*view) for view in batch]
-    pictures = render_views(views, [background] * len(views), offset.unbind())
+    pictures = _render(backend, views, [background] * len(views), offset.unbind())
     return Rendering(
         torch.stack([picture.image for picture in pictures]),
         torch.stack([picture.alpha for picture in pictures]),
         torch.stack([picture.radii for picture in pictures]),
         offset,
-        torch.stack(_depths(views, pictures, render_views)) if depth else None,
+        torch.stack(_depths(views, pictures, backend)) if depth else None,
     )
 
 
@@ -107,17 +92,17 @@ def rasterize_each(views: Sequence[View], backgrounds: Sequence[Float[Tensor, " 
     offsets = [
         like.new_zeros(()).expand(len(gaussians), 2).requires_grad_(torch.is_grad_enabled()) for gaussians, _ in views
     ]
-    return _BACKENDS[choose_backend(like)]([_in_local_frame(*view) for view in views], backgrounds, offsets)
+    return _render("auto", [_in_local_frame(*view) for view in views], backgrounds, offsets)
 
 
-def _depths(views: Sequence[View], pictures: Sequence[Rendering], render_views: RenderViews) -> list[Tensor]:
+def _depths(views: Sequence[View], pictures: Sequence[Rendering], backend: Backend) -> list[Tensor]:
     """The expected depth of each view: depths blended like colours, divided by the sum of their weights."""
     colored = []
     for gaussians, camera in views:
         depths = gaussians.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         colored.append((replace(gaussians, sh=sh_from_rgb(depths[:, None, None].expand(-1, 1, 3))), camera))
     black, offsets = views[0][0].means.new_zeros(3), [torch.zeros_like(picture.means2d_offset) for picture in pictures]
-    blended = [picture.image[..., 0] for picture in render_views(colored, [black] * len(views), offsets)]
+    blended = [picture.image[..., 0] for picture in _render(backend, colored, [black] * len(views), offsets)]
     return [
         torch.where(picture.alpha > 0, sums / picture.alpha.clamp_min(1e-6), 0)
         for sums, picture in zip(blended, pictures, strict=True)
@@ -168,3 +153,18 @@ def _in_local_frame(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Ca
     if pose is None:
         return gaussians, camera
     return replace(gaussians, T_world_local=None), replace(camera, viewmat=compose_rigid(camera.viewmat, pose))
+
+
+def close_holes(image: Float[Tensor, "h w c"], reach: int) -> Float[Tensor, "h w c"]:
+    """The picture after erosion and dilation, each channel alone.
+
+    Erosion gives each pixel the darkest value around it, dilation the brightest. Bright specks that are at most twice
+    `reach` wide go, such as a white background that shows through holes; the rest keeps its size. Transparent pictures
+    have no background that could show through. PointAvatar closes holes between its points so.
+    """
+    if reach == 0:
+        return image
+    planes, side = image.movedim(-1, 0)[None], 2 * reach + 1
+    eroded = -torch.nn.functional.max_pool2d(-planes, side, stride=1, padding=reach)
+    dilated = torch.nn.functional.max_pool2d(eroded, side, stride=1, padding=reach)
+    return dilated[0].movedim(0, -1).contiguous()

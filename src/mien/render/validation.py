@@ -45,7 +45,8 @@ def check_shapes(gaussians: Gaussians, background: Tensor) -> None:
 
 def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> None:
     """Raise a `NotFiniteError` that names the tensor and index of the first NaN or infinity."""
-    tensors = named_tensors(gaussians, background) | {"camera.viewmat": camera.viewmat, "camera.K": camera.K}
+    names = ("means", "quats", "scales", "opacities", "sh", "background", "camera.viewmat", "camera.K")
+    tensors = dict(zip(names, (*_parts(gaussians), background, camera.viewmat, camera.K), strict=True))
     # Check all tensors at once, because on a GPU every answer makes the host wait.
     if bool(torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).all()):
         return
@@ -59,22 +60,11 @@ def check_finite(gaussians: Gaussians, camera: Camera, background: Tensor) -> No
 
 @contextmanager
 def drawable(what: str, remedy: str) -> Iterator[None]:
-    """Turn a `CannotDrawError` inside the context into a message for the user.
-
-    Args:
-        what: What cannot be drawn, for the start of the message.
-        remedy: What to do about it, for the end of the message.
-    """
+    """Turn a `CannotDrawError` inside the context into a message for the user, with what cannot be drawn."""
     try:
         yield
     except CannotDrawError as error:
         raise UserError(f"{what}: cannot be drawn ({error}); {remedy}") from None
-
-
-def named_tensors(gaussians: Gaussians, background: Tensor) -> dict[str, Tensor]:
-    """The inputs by the names that messages use."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return dict(zip(names, _parts(gaussians), strict=True)) | {"background": background}
 
 
 def _parts(gaussians: Gaussians) -> tuple[Tensor, ...]:

@@ -8,8 +8,9 @@ Gaussians' centres move with a mesh (`MeshBound`), move by their own blend direc
 fields, so neither can change.
 
 Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
-joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel, r activations, i inputs
-(e expression coefficients, then 3 j angles).
+joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel, r activations or directions
+of the face, c of these that bases take, w features, i inputs (e expression coefficients, then 3 j angles).
+`mien.runtime.checks` compares arrays with these letters.
 """
 
 from dataclasses import dataclass
@@ -68,8 +69,8 @@ class FeatureDirections:
 
     rest: Float32[np.ndarray, " i"]
     """Inputs at which features do not change: the person at rest."""
-    directions: Float32[np.ndarray, "i k"]
-    basis: Float32[np.ndarray, "n k w"]
+    directions: Float32[np.ndarray, "i r"]
+    basis: Float32[np.ndarray, "n r w"]
     """Change of the features of each Gaussian per unit along each direction."""
 
 
@@ -102,10 +103,10 @@ class FeatureChanges:
     whose hidden layer has leaky ReLU with the slope 0.01. Its outputs are three changes of colour, then one of opacity.
     """
 
-    neutral: Float32[np.ndarray, "n _"]
-    """[n, w]: features of each Gaussian."""
-    basis: Float32[np.ndarray, "n _ _"]
-    """[n, r, w]: change of the features per unit of each activation."""
+    neutral: Float32[np.ndarray, "n w"]
+    """Features of each Gaussian."""
+    basis: Float32[np.ndarray, "n r w"]
+    """Change of the features per unit of each activation."""
     own: Float32[np.ndarray, "n _"]
     """Numbers of each Gaussian that go into the network after its features."""
     weights: tuple[Float32[np.ndarray, "_ _"], ...]
@@ -125,13 +126,13 @@ class ExpressionChanges:
     rest: Float32[np.ndarray, " i"]
     """Inputs of the person at rest: expression coefficients, then axis-angle vectors of the free joints, in radians."""
     directions: Float32[np.ndarray, "i r"]
-    seen: Float32[np.ndarray, "_ _"]
-    """[s, r]: activations that are allowed: those of training frames that go furthest along one of these, and a fifth
+    seen: Float32[np.ndarray, "_ r"]
+    """Activations that are allowed: those of training frames that go furthest along one of these, and a fifth
     more. No rows shorten nothing."""
-    color: Float32[np.ndarray, "n 3 _"] | None = None
-    """[n, 3, r], or [n, 3, c]: changes of the first SH coefficient per unit of each activation."""
-    opacity_logits: Float32[np.ndarray, "n _"] | None = None
-    means: Float32[np.ndarray, "n 3 _"] | None = None
+    color: Float32[np.ndarray, "n 3 c"] | None = None
+    """Changes of the first SH coefficient per unit of each activation."""
+    opacity_logits: Float32[np.ndarray, "n c"] | None = None
+    means: Float32[np.ndarray, "n 3 c"] | None = None
     """Changes of the centres, in the triangle's frame and units."""
     features: FeatureChanges | None = None
     """Further changes of colours and opacities."""

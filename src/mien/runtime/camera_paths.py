@@ -1,4 +1,4 @@
-"""Camera paths around a head in numpy, the counterpart of `mien.render.camera_paths` in torch."""
+"""Angles of camera paths around a head, and cameras in numpy, as `mien.render.camera_paths` has them in torch."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,10 +31,7 @@ def zoom_for_all(shown: Callable[[float], Bool[np.ndarray, "h w"]]) -> float:
     """The largest magnification, of 1 and less, at which a head reaches neither the top nor a side of the picture.
 
     A filmed frame may cut off the crown of a head, which the avatar has. A neck may end at the bottom. What fills any
-    picture keeps 1.
-
-    Args:
-        shown: Returns where anything is drawn, at a magnification.
+    picture keeps 1. `shown` returns where anything is drawn, at a magnification.
     """
     for zoom in _ZOOMS:
         mask = shown(zoom)
@@ -67,19 +64,22 @@ def turned(camera: Camera, center: Float[np.ndarray, " 3"], yaw: float, pitch: f
     return orbit(raised, center, yaw) if yaw else raised
 
 
-def turntable(camera: Camera, center: Float[np.ndarray, " 3"], frames: int, span: float) -> list[Camera]:
-    """Cameras on a turn around `center`. Below a full turn of 2 pi, they swing to both sides, as a pendulum does."""
+def turntable(frames: int, span: float) -> list[tuple[float, float]]:
+    """Yaws and pitches (`turned`) of a turn around a head, in radians. The first is 0, and the path loops.
+
+    If `span` is below a full turn, the camera swings instead, as a pendulum does: to span / 2 on the subject's left,
+    back through the middle to the right, and home.
+    """
     phases = [2 * math.pi * index / frames for index in range(frames)]
     full = span >= 2 * math.pi
-    return [orbit(camera, center, phase if full else 0.5 * span * math.sin(phase)) for phase in phases]
+    return [(phase if full else 0.5 * span * math.sin(phase), 0.0) for phase in phases]
 
 
-def sway(
-    camera: Camera, center: Float[np.ndarray, " 3"], frames: int, span: float, tilt: float, crossing: bool = True
-) -> list[Camera]:
-    """Cameras on a horizontal figure eight around the position of `camera`, or on an oval without `crossing`."""
-    views = []
-    for phase in (2 * math.pi * index / frames for index in range(frames)):
-        raised = 0.5 * tilt * (math.sin(2 * phase) if crossing else math.cos(phase))
-        views.append(turned(camera, center, 0.5 * span * math.sin(phase), raised))
-    return views
+def sway(frames: int, span: float, tilt: float, crossing: bool = True) -> list[tuple[float, float]]:
+    """Yaws and pitches of a horizontal figure eight, or of an oval without `crossing`, in radians. The path loops.
+
+    `span` is the angle from the far left to the far right, `tilt` that from the highest to the lowest point.
+    """
+    phases = [2 * math.pi * index / frames for index in range(frames)]
+    raised = [math.sin(2 * phase) if crossing else math.cos(phase) for phase in phases]
+    return [(0.5 * span * math.sin(phase), 0.5 * tilt * up) for phase, up in zip(phases, raised, strict=True)]

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import safetensors
-from jaxtyping import jaxtyped
 
 from mien.disk.config import decode
 from mien.disk.files import check_writable, expect_whole, read_safetensors, write_arrays
@@ -29,11 +28,7 @@ _REMEDY = "write one with `mien export DIR --out me.mien`"
 
 
 def write_portable(path: Path, avatar: PortableAvatar) -> None:
-    """Write a .mien file atomically. The same avatar gives the same bytes.
-
-    Raises:
-        UserError: the path cannot be written, or an array holds NaN or infinity.
-    """
+    """Write a .mien file atomically. The same avatar gives the same bytes."""
     check_writable(path)
     header, arrays = to_arrays(path, avatar)
     # A single entry, because safetensors writes several in random order.
@@ -41,11 +36,7 @@ def write_portable(path: Path, avatar: PortableAvatar) -> None:
 
 
 def read_portable(path: Path) -> PortableAvatar:
-    """Read a .mien file. All of its content is checked, so that the result can be posed.
-
-    Raises:
-        UserError: the file is missing, damaged, of another version, or not a .mien file.
-    """
+    """Read a .mien file. All of its content is checked, so that the result can be posed."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; {_REMEDY}")
     if path.stat().st_size > _MAX_BYTES:
@@ -91,7 +82,7 @@ def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> Porta
         tree = _restored(header["content"], dict(arrays))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: is damaged ({repr(error)[:200]}); export it again with `mien export`") from None
-    with expect_whole(path, "export it again with `mien export`"), jaxtyped("context"):
+    with expect_whole(path, "export it again with `mien export`"):
         avatar: PortableAvatar = decode(PortableAvatar, tree, str(path), "export it again with `mien export`")
     check(avatar, str(path))
     return avatar

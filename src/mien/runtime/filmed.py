@@ -46,13 +46,7 @@ def within_filmed_inputs(
 
     First each number on its own (`soft_limits`). Then all of them together: if their length |(inputs - rest)
     directions| is beyond `reach`, all differences from `rest` are shortened by one factor, so that a rare combination
-    becomes weaker and keeps its kind.
-
-    Args:
-        filmed: What training saw.
-        inputs: The timesteps to limit.
-        rest: The inputs of the person at rest.
-        bounds: Lowest and highest coefficient of each expression that the face model can show.
+    becomes weaker and keeps its kind. `bounds` are those of the coefficients that the face model can show.
     """
     least = np.full(inputs.shape[1], LEAST_JOINT)
     least[: len(bounds)] = np.maximum(LEAST_EXPRESSION * np.abs(bounds).max(1), 1e-6)
@@ -71,10 +65,8 @@ def head_angles(
 ) -> Float[np.ndarray, "t 2"]:
     """Yaw and pitch of the camera as the head sees it, in radians: to the subject's left, and upwards.
 
-    Args:
-        rotation: Axis-angle vectors of the head frame in world space, in radians.
-        translation: Origins of the head frame in world space, in metres.
-        eye: Position of the camera in world space, in metres, for all timesteps or for each.
+    Rotation (axis-angle, in radians) and translation (in metres) are those of the head frame in world space. `eye` is
+    the camera's position there, for all timesteps or for each.
     """
     return _angles(_towards(rotation, translation, eye))
 

@@ -77,9 +77,7 @@ def parts_of(name: str, value: float) -> list[Part]:
 def gaze_of(look: Mapping[str, float | np.ndarray], side: str) -> tuple[float | np.ndarray, float | np.ndarray]:
     """Pitch and yaw of an eye for eyeLook coefficients, in radians: down and to the subject's left are positive.
 
-    Args:
-        look: Coefficients by name. Missing ones are 0.
-        side: Left or Right.
+    `look` has coefficients by name, of which missing ones are 0. `side` is Left or Right.
     """
     to_left, to_right = (look.get(f"eyeLook{way}{side}", 0.0) for way in _SIDES[side])
     down, up = (look.get(f"eyeLook{way}{side}", 0.0) for way in ("Down", "Up"))
@@ -100,12 +98,9 @@ def within_lids(eyes: Float32[np.ndarray, "*t 3"]) -> Float32[np.ndarray, "*t 3"
 def turned_eyes(
     joints: Float32[np.ndarray, "*t j 3"], joint_names: Sequence[str], look: Mapping[str, float]
 ) -> Float32[np.ndarray, "*t j 3"]:
-    """Joints whose eyes look aside from where they look, by eyeLook coefficients. Eyes without a coefficient stay.
+    """Free joints whose eyes look aside from where they look, by eyeLook coefficients. Eyes without one stay.
 
-    Args:
-        joints: Axis-angle vectors of the free joints, in radians.
-        joint_names: Names of the free joints.
-        look: eyeLook coefficients by name.
+    Joints are axis-angle vectors in radians, in the order of their names.
     """
     turned = joints.copy()
     for side in sorted({_side(name) for name in look if is_gaze(name, joint_names)}):

@@ -352,14 +352,10 @@ def sigmoid(values: Float32[np.ndarray, "*s"]) -> Float32[np.ndarray, "*s"]:
     return out
 
 
-def _softplus(values: np.ndarray) -> np.ndarray:
-    return np.logaddexp(values, np.float32(0))
-
-
 _ACTIVATIONS = {
     "relu": lambda values: np.maximum(values, 0),
     "leaky_relu": lambda values: np.maximum(values, np.float32(0.01) * values),
-    "softplus": _softplus,
+    "softplus": lambda values: np.logaddexp(values, np.float32(0)),
 }
 
 

@@ -6,7 +6,7 @@ the template, which stays as it is, looks like the picture. This is tracking: a 
 face parameters, as in every fit to pixels, and reaches no avatar and no face of another frame.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -149,7 +149,7 @@ def align_faces(
 ) -> list[FaceParams]:
     """Return the face parameters of each sequence with which a fixed avatar looks most like the pictures.
 
-    Each timestep descends on its own on L1 and SSIM, for the same number of steps (`FaceDescent`). Timesteps in which
+    Each timestep descends on its own on L1 and SSIM, for the same number of steps (`descend`). Timesteps in which
     nothing was found, or in which a hand covers the face, get corrections from their neighbours.
     Some frames of `known`, on which the avatar was trained, say how large gradients are, and they alone say what
     corrections of head poses share. With a folder, a stopped call continues there.
@@ -163,9 +163,7 @@ def align_faces(
     trained = {frame[:2] for frame in known}
     judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, _ALIGNED_JUDGED)
     with one_torch_thread(), frozen(avatar):
-        descent = FaceDescent(
-            _sizes([_Batch.of(part, track, targets, gains) for part in _batches(judged)], avatar, track)
-        )
+        sizes = _sizes([_Batch.of(part, track, targets, gains) for part in _batches(judged)], avatar, track)
         indices = [track.index_of(*timestep[:2]) for timestep in timesteps]
         done = _take_up(folder, track, indices)
         with progress("aligning frames", len(timesteps), done) as advance:
@@ -173,7 +171,7 @@ def align_faces(
                 batch = _Batch.of(part, track, targets, gains)
                 for _ in range(settings.iterations):
                     batch.find_gradients(avatar, track)
-                    descent.step(batch.groups(track))
+                    descend(batch.groups(track), sizes)
                     for index in batch.indices:
                         track.confine(index)
                 done += len(part)
@@ -265,32 +263,26 @@ class _Batch:
         torch.autograd.backward(losses)
 
 
-@dataclass(frozen=True, eq=False)
-class FaceDescent:
-    """Steps along the gradient with momentum, in units of its usual size.
+@torch.no_grad()
+def descend(groups: Items[ParameterGroup], sizes: Mapping[str, float]) -> None:
+    """A step along the gradient with momentum, in units of its usual size. The gradients are cleared.
 
-    Adam divides the gradient of a timestep by its own size, so that its first steps move every coefficient by the
-    whole rate, whether it matters or not. Here, what matters more moves further, and a timestep that fits stays.
+    `sizes` are the root mean squares of each group's gradients over coefficients and over some timesteps. Adam divides
+    the gradient of a timestep by its own size, so that its first steps move every coefficient by the whole rate,
+    whether it matters or not. Here, what matters more moves further, and a timestep that fits stays.
     """
-
-    sizes: dict[str, float]
-    """Root mean square of each group's gradients, by name, over coefficients and over some timesteps."""
-
-    @torch.no_grad()
-    def step(self, groups: Items[ParameterGroup]) -> None:
-        """Move the parameters, and clear their gradients."""
-        kept = _ALIGNED_MOMENTUM
-        for group in groups:
-            for (name, tensor), gradient in zip(group.tensors.items(), _taken(group), strict=True):
-                state = _moments(group, name)
-                state.step += 1
-                state.first.lerp_(gradient, 1 - kept)
-                unbiased = state.first / (1 - kept ** state.step.item())
-                tensor -= group.rate.start / max(self.sizes[group.name], _EPSILON) * unbiased
+    kept = _ALIGNED_MOMENTUM
+    for group in groups:
+        for (name, tensor), gradient in zip(group.tensors.items(), _taken(group), strict=True):
+            state = _moments(group, name)
+            state.step += 1
+            state.first.lerp_(gradient, 1 - kept)
+            unbiased = state.first / (1 - kept ** state.step.item())
+            tensor -= group.rate.start / max(sizes[group.name], _EPSILON) * unbiased
 
 
 def _sizes(batches: list[_Batch], avatar: Avatar, track: FaceTrack) -> dict[str, float]:
-    """`FaceDescent.sizes` at the present parameters of some batches."""
+    """The sizes for `descend` at the present parameters of some batches."""
     found: dict[str, list[Tensor]] = {}
     for batch in batches:
         batch.find_gradients(avatar, track)

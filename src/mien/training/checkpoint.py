@@ -71,14 +71,14 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     for prefix, joined in state.joined().items():
         tensors |= {f"{prefix}.{name}": tensor for name, tensor in joined.state().items()}
     tensors |= {f"curves.{name}": torch.tensor(curve, dtype=torch.float64) for name, curve in state.curves.items()}
-    for owner, moments in (("store", state.avatar.gaussian_store().moments), ("adam", state.adam.state())):
+    for owner, moments in (("store", state.avatar.store.moments), ("adam", state.adam.state())):
         for name, own in moments.items():
             tensors |= {f"{owner}.{name}:{field.name}": getattr(own, field.name) for field in fields(own)}
     tensors |= {
         "step": torch.tensor(state.step),
         "seconds": torch.tensor(state.seconds, dtype=torch.float64),
         "peak_memory_mb": torch.tensor(state.peak_memory_mb, dtype=torch.float64),
-        "gaussians": torch.tensor(len(state.avatar.gaussian_store())),
+        "gaussians": torch.tensor(len(state.avatar.store)),
     }
     write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
     # Also delete unfinished files of a process that was killed while it wrote.
@@ -121,7 +121,7 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
         if not name.startswith("curves.") and not bool(tensor.isfinite().all()):
             raise ValueError(f"{name} is not finite")
     overwrite(state.avatar, part("avatar."), int(tensors["gaussians"]), path)
-    store = state.avatar.gaussian_store()
+    store = state.avatar.store
     store.moments.update(_moments(part("store."), {name: store[name] for name in store.names()}))
     own = [group for group in state.avatar.parameter_groups() if group.moments is None]
     state.adam.load_state(

@@ -200,7 +200,7 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
     summary = {
         "steps": state.step,
         "seconds": round(state.seconds, 1),
-        "gaussians": len(state.avatar.gaussian_store()),
+        "gaussians": len(state.avatar.store),
         "step_ms_median": round(float(np.median(state.curves["step_ms"])), 3),
         "peak_memory_mb": round(state.peak_memory_mb, 1),
     }

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Posed, move_avatar
 from mien.avatar.baking import measure_filmed
+from mien.avatar.density import DensityControl, GradientDensity
 from mien.avatar.files import load_avatar
 from mien.avatar.methods import method_named, method_of
 from mien.avatar.settings import FaceTuning, MethodConfig, Progress
+from mien.avatar.store import GaussianStore
 from mien.disk.locks import hold
 from mien.errors import UserError
 from mien.face.checks import check_face_params
@@ -43,7 +45,9 @@ from mien.training.batch import (
 )
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
 from mien.training.colors import camera_colors, frame_gains
-from mien.training.density_control import density_strategy
+from mien.training.density_control.gradient import GradientStrategy
+from mien.training.density_control.refill import RefillStrategy
+from mien.training.density_control.strategy import DensityStrategy
 from mien.training.footage.coverage import measure_coverage, representative_frames
 from mien.training.footage.face_track import FaceTrack, turns_from_mean
 from mien.training.footage.frames import (
@@ -236,14 +240,14 @@ def start(
     shown = sorted(set(used))
     avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     footage = Footage(face_model, sequences, faces, frames)
-    fitted = fitted_faces(footage, settings, bound=avatar.surface() is not None)
+    fitted = fitted_faces(footage, settings, bound=avatar.extras.surface is not None)
     if fitted is not None:
         faces, footage = fitted, replace(footage, faces=fitted)
         avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     face = concatenate(faces)
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
     avatar.filmed = measure_filmed(face[used], avatar.subject, eyes)
-    surface = avatar.surface()
+    surface = avatar.extras.surface
     if surface is not None and surface.wants_first_colors:
         surface.set_first_colors(vertex_colors(footage))
     like = torch.zeros(()) if like is None else like
@@ -253,7 +257,7 @@ def start(
     move_avatar(avatar, like)
     face = face.to(like)
     head, density = None if make_head is None else make_head(like), avatar.density()
-    strategy = density_strategy(density if head is None else head.density(density), avatar.gaussian_store())
+    strategy = density_strategy(density if head is None else head.density(density), avatar.store)
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     tuning = tuning_for(method_config.face_tuning, sequences)
     track = FaceTrack(face, tuning, lengths, face_model.expression_bounds, away, shown)
@@ -265,6 +269,16 @@ def _first_avatar(config: MethodConfig, face_model: FaceModel, face: FaceParams,
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         return method_named(method_of(config)).avatar(config, face_model, face)
+
+
+def density_strategy(density: DensityControl, store: GaussianStore) -> DensityStrategy | None:
+    """The strategy that a method's description asks for."""
+    if density is None:
+        return None
+    device = store[store.names()[0]].device
+    if isinstance(density, GradientDensity):
+        return GradientStrategy(density, len(store), device)
+    return RefillStrategy(density, len(store), device)
 
 
 def tuning_for(tuning: FaceTuning, sequences: Items[Sequence]) -> FaceTuning:
@@ -335,7 +349,7 @@ def _update(
     if state.density is None:
         return False
     random = partial(random_at, settings.seed, DENSITY, progress.step)
-    return state.density.adapt(state.avatar.gaussian_store(), posed[0], progress, random)
+    return state.density.adapt(state.avatar.store, posed[0], progress, random)
 
 
 def _after_update(
@@ -354,7 +368,7 @@ def _after_update(
             ]
             return head.redundant(views, last=last)
 
-        state.density.thin(state.avatar.gaussian_store(), redundant)
+        state.density.thin(state.avatar.store, redundant)
 
 
 def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: float, step_ms: float) -> str:
@@ -364,7 +378,7 @@ def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: fl
     for name in rare:
         entry.setdefault(name, 0.0)
     entry |= {"step": state.step, "loss": sum(entry.values()), "psnr": psnr}
-    entry |= {"gaussians": len(state.avatar.gaussian_store()), "step_ms": step_ms}
+    entry |= {"gaussians": len(state.avatar.store), "step_ms": step_ms}
     for name, value in entry.items():
         state.curves.setdefault(name, []).append(value)
     return f"loss {entry['loss']:.4f}, PSNR {entry['psnr']:.1f} dB, {entry['gaussians']} Gaussians"

@@ -66,21 +66,10 @@ def blended_features(
     return _Blend.apply(gradient, bases, inputs, neutral)
 
 
-def feature_network_reference(
-    bases: Float[Tensor, "n k f"],
-    inputs: Float[Tensor, " k"],
-    neutral: Float[Tensor, "n f"],
-    own: Float[Tensor, "n x"],
-    layers: Layers,
-) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
-    """`feature_network` in plain PyTorch, whose bases have a common gradient."""
-    return network_outputs(neutral + torch.einsum("nkf,k->nf", bases, inputs), own, layers)
-
-
 def network_outputs(
     features: Float[Tensor, "n f"], own: Float[Tensor, "n x"], layers: Layers
 ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
-    """The network in plain PyTorch, differentiable in everything: all outputs but the last, and the last."""
+    """The network on blended features, in plain PyTorch: all outputs but the last, and the last."""
     hidden = torch.cat([features, own], dim=-1) @ layers.weight1.T + layers.bias1
     outputs = torch.nn.functional.leaky_relu(hidden, SLOPE) @ layers.weight2.T + layers.bias2
     return outputs[:, :-1], outputs[:, -1]

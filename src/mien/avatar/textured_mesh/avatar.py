@@ -10,8 +10,7 @@ Hanrahan, SIGGRAPH 2001).
 Offsets and a part of the albedo belong to vertices and are averaged over neighbours, as a smooth change of variables
 whose gradient is smooth as well. Teeth, tongue, eyes and the inside of the mouth have no offsets.
 
-A baked record has no colours that depend on normals, so light is by default that on the face at rest, in the head's
-frame. With light in the world (`light`), a person may turn before a fixed lamp, and such an avatar is not baked.
+A baked record has no colours that depend on normals, so light is that on the face at rest, in the head's frame.
 """
 
 import math
@@ -23,27 +22,31 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from mien.avatar.avatar import UNBAKED_REMEDY, Avatar, Extras, ParameterGroup, Posed, store_group
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, store_group
 from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
 from mien.avatar.ops.triangle_frames import corners_in_frames, ellipses_of_corners, triangle_frames
-from mien.avatar.settings import TRAINED, Progress
+from mien.avatar.settings import TRAINED, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.avatar.textured_mesh.settings import TexturedMeshConfig
 from mien.avatar.textured_mesh.surfels import Neighbours, Surfels, place_surfels
-from mien.errors import UserError
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.face.posing import head_poses
 from mien.gaussians import Rendering, sh_from_rgb
 from mien.render.mesh import shade, vertex_normals
 from mien.runtime.baked import Attributes, MeshBound
 
 _OPACITY = 0.99
 """Opacity of every surfel in its middle. The kernel lets none be 1."""
-_UNBAKED = "the setting light world of textured_mesh: light on turning normals is no function of the expression"
+OVERLAP = 2.5
+"""Scales of a surfel, in standard deviations of what it covers. Below about 2.3, what is behind shows through."""
+_OFFSET_WEIGHT = 0.02  # of the mean squared distance of offsets from their neighbours' mean, in square millimetres
+_ALBEDO_WEIGHT = 0.003  # of that of albedos of surfels and vertices, and of neighbours, as logits
+_NORMAL_WEIGHT = 0.01  # of the mean squared slope by which the normal map bends normals
+_LIGHT_WEIGHT = 0.01
+"""Weight of the mean squared difference from white light. Without it, skin and light can be exchanged."""
 _MILLIMETRE = 1e-3
 
 
@@ -52,11 +55,10 @@ class _AtRest(NamedTuple):
 
     offsets: Float[Tensor, "v 3"]
     vertex_albedo: Float[Tensor, "v 3"]
-    albedo: Float[Tensor, "n 3"]
     local: dict[str, Tensor]
     """Raw tensors of the surfels in the frames of their triangles."""
-    colors: Float[Tensor, "n 3"] | None
-    """Colours of the face at rest. None with light in the world."""
+    colors: Float[Tensor, "n 3"]
+    """Colours of the face at rest."""
 
 
 class TexturedMesh(Avatar):
@@ -65,8 +67,7 @@ class TexturedMesh(Avatar):
     config: TexturedMeshConfig
 
     def __init__(self, config: TexturedMeshConfig, face_model: FaceModel, face: FaceParams):
-        unbaked = _UNBAKED if config.light == "world" else None
-        super().__init__(config, face_model, face, Extras(unbaked=unbaked))
+        super().__init__(config, face_model, face)
         like, faces = face_model.template, face_model.faces
         face_index = place_surfels(face_model.rest_vertices(self.subject), faces, config.surfels)
         n = len(face_index)
@@ -91,34 +92,32 @@ class TexturedMesh(Avatar):
         rest = self._rest()
         own = face.vertex_offsets
         face = replace(face, vertex_offsets=rest.offsets if own is None else own + rest.offsets)
-        sh = sh_from_rgb(rest.albedo if rest.colors is None else rest.colors)[:, None]
+        sh = sh_from_rgb(rest.colors)[:, None]
         gaussians = pose_bound_gaussians(self.face_model, face, rest.local, sh, in_head=True)
-        if rest.colors is None:
-            gaussians = replace(gaussians, sh=sh_from_rgb(self._world_colors(face, rest.albedo))[..., None, :])
         return Posed(gaussians, {"offsets": rest.offsets, "vertex_albedo": rest.vertex_albedo})
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """Penalties of rough offsets, rough albedo, bent normals, and light that is not white from everywhere."""
-        config, store = self.config, self.store
+        store = self.store
         values = torch.cat([posed.aux["offsets"] / _MILLIMETRE, posed.aux["vertex_albedo"]], dim=-1)
         offsets, albedo = (values - self.neighbours.means(values)).square().split(3, dim=-1)
         detail = store["albedo"].square().sum(1).mean()
         return {
-            "offsets": config.offset_weight * offsets.sum(1).mean(),
-            "albedo": config.albedo_weight * (albedo.sum(1).mean() + detail),
-            "normals": config.normal_weight * store["slopes"].square().sum(1).mean(),
-            "light": config.light_weight * (self.light - white_light(self.light)).square().mean(),
+            "offsets": _OFFSET_WEIGHT * offsets.sum(1).mean(),
+            "albedo": _ALBEDO_WEIGHT * (albedo.sum(1).mean() + detail),
+            "normals": _NORMAL_WEIGHT * store["slopes"].square().sum(1).mean(),
+            "light": _LIGHT_WEIGHT * (self.light - white_light(self.light)).square().mean(),
         }
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """Per-surfel tensors, those of the vertices, and the light."""
-        config = self.config
+        albedo_rate = Rate(2e-2, 2e-3)  # of logits
         return [
-            store_group(self.store, "albedo", config.albedo_rate),
-            store_group(self.store, "slopes", config.normal_rate),
-            ParameterGroup("offsets", {"vertex_means": self.vertex_means}, config.offset_rate),
-            ParameterGroup("vertex_albedo", {"vertex_albedo": self.vertex_albedo}, config.albedo_rate),
-            ParameterGroup("light", {"light": self.light}, config.light_rate),
+            store_group(self.store, "albedo", albedo_rate),
+            store_group(self.store, "slopes", Rate(1e-2, 1e-3)),
+            ParameterGroup("offsets", {"vertex_means": self.vertex_means}, Rate(2e-4, 2e-5)),
+            ParameterGroup("vertex_albedo", {"vertex_albedo": self.vertex_albedo}, albedo_rate),
+            ParameterGroup("light", {"light": self.light}, Rate(5e-3, 5e-4)),
         ]
 
     def density(self) -> None:
@@ -127,10 +126,7 @@ class TexturedMesh(Avatar):
     @torch.no_grad()
     def bake(self) -> MeshBound:
         """The mesh with its offsets, and surfels in constant colours."""
-        if self.extras.unbaked is not None:
-            raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         rest = self._compute_rest()
-        assert rest.colors is not None
         local = {name: as_array(value) for name, value in rest.local.items()}
         sh = as_array(sh_from_rgb(rest.colors)[:, None])
         return MeshBound(
@@ -154,7 +150,7 @@ class TexturedMesh(Avatar):
         vertices = self.face_model.rest_vertices(self._moved_subject(offsets))
         corners = corners_in_frames(vertices, faces)
         means, albedo = surfels.at_corners(torch.cat([corners, vertex_albedo[faces]], dim=-1)).split(3, dim=-1)
-        shapes = torch.cat(ellipses_of_corners(corners, self.config.overlap), dim=-1)
+        shapes = torch.cat(ellipses_of_corners(corners, OVERLAP), dim=-1)
         quats, log_scales = surfels.at_triangles(shapes).split([4, 3], dim=-1)
         shares = surfels.shares()
         local = {
@@ -165,8 +161,7 @@ class TexturedMesh(Avatar):
             "opacity_logits": torch.full_like(shares, math.log(_OPACITY / (1 - _OPACITY))),
         }
         albedo = sigmoid(store["albedo"] + albedo)
-        colors = albedo * shade(self._normals(vertices), self.light) if self.config.light == "head" else None
-        return _AtRest(offsets, vertex_albedo, albedo, local, colors)
+        return _AtRest(offsets, vertex_albedo, local, albedo * shade(self._normals(vertices), self.light))
 
     def _surfels(self) -> Surfels:
         return Surfels(self.store["face_index"], len(self.face_model.faces), self.face_model.template)
@@ -183,12 +178,8 @@ class TexturedMesh(Avatar):
         offsets, albedo = values.split(3, dim=-1)
         return offsets * self.get_buffer("movable"), albedo
 
-    def _world_colors(self, face: FaceParams, albedo: Float[Tensor, "n 3"]) -> Float[Tensor, "b n 3"]:
-        normals = self._normals(self.face_model.head_vertices(face))
-        return albedo * shade(normals @ head_poses(face)[:, :3, :3].transpose(1, 2), self.light)
-
-    def _normals(self, vertices: Float[Tensor, "*b v 3"]) -> Float[Tensor, "*b n 3"]:
-        """Unit normals at the surfels of a posed mesh, bent by the normal map along the axes of triangles."""
+    def _normals(self, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "n 3"]:
+        """Unit normals at the surfels of a mesh, bent by the normal map along the axes of triangles."""
         faces, surfels = self.face_model.faces, self.surfels
         smooth = surfels.at_corners(vertex_normals(vertices, faces)[..., faces.long(), :])
         axes = surfels.at_triangles(triangle_frames(vertices, faces).R[..., ::2].flatten(-2))

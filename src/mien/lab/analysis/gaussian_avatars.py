@@ -170,7 +170,7 @@ def speed(context: Context) -> Result:
         "Width x height", "Frames/s", "Paper", "Drawing, ms", "Posing, ms", "Pictures timed", "Memory added, MB",
         "Memory in all, MB",
     )  # fmt: skip
-    count, threads, second = len(context.avatar.gaussian_store()), rows[0]["threads"], rows[1]
+    count, threads, second = len(context.avatar.store), rows[0]["threads"], rows[1]
     slower = rows[0]["fps"] / max(rows[-1]["fps"], 1e-6)
     pixels = np.array([row["width"] * row["height"] for row in rows]) / 1e6
     ours, paper = (np.array([row[name] for row in rows], np.float64) for name in ("fps", "paper_fps"))
@@ -210,7 +210,7 @@ def teeth(context: Context) -> Result:
     of_teeth = model.region_mask("teeth")
     if not bool(of_teeth.any()):
         return Result({"teeth_triangles": 0}, [_NO_TEETH])
-    kept = ~of_teeth[avatar.gaussian_store()["face_index"].long()]
+    kept = ~of_teeth[avatar.store["face_index"].long()]
     count, triangles = int((~kept).sum()), int(of_teeth.sum())
     face = open_jaw(avatar.subject, model)
     camera = mouth_camera(model, face, context.camera, _SIDE)
@@ -431,7 +431,7 @@ def scale(context: Context) -> Result:
 
 def _median_scale(run: Run) -> float:
     """The median, over the Gaussians, of the largest scale in units of the triangle."""
-    return float(torch.exp(run.avatar.gaussian_store()["log_scales"].detach()).amax(-1).median())
+    return float(torch.exp(run.avatar.store["log_scales"].detach()).amax(-1).median())
 
 
 def _late_step_ms(run: Run) -> float:

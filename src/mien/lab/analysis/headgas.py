@@ -353,7 +353,7 @@ def sizes(context: Context) -> Result:
         for row in rows
     ]  # fmt: skip
     heading = ("Width x height", "Frame, ms", "Paper, ms", "Features and network, ms", "Drawing, ms", "Pictures timed")
-    count, threads = len(context.avatar.gaussian_store()), rows[0]["threads"]
+    count, threads = len(context.avatar.store), rows[0]["threads"]
     names = ("width", "frame_ms", "paper_ms")
     sides, ours, paper = (np.array([row[name] for row in rows], np.float64) for name in names)
     slower = rows[-1]["frame_ms"] / max(rows[0]["frame_ms"], 1e-6)

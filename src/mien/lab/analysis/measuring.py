@@ -66,7 +66,7 @@ def measure_drawing(
     return {
         "width": camera.width,
         "height": camera.height,
-        "gaussians": len(avatar.gaussian_store()),
+        "gaussians": len(avatar.store),
         "threads": _native.thread_count(),
         "draw_ms": _median(draws[counted]),
         "pose_ms": _median(poses[counted]),

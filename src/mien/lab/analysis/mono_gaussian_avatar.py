@@ -60,7 +60,7 @@ def times(context: Context) -> Result:
         avatar.train(training)
         rows[name] = measure_drawing(avatar, context.camera.fitted(SIDE, SIDE), context.options.seconds)
     frames = {name: round(row["draw_ms"] + row["pose_ms"], 3) for name, row in rows.items()}
-    hours, count = context.summary["seconds"] / 3600, len(avatar.gaussian_store())
+    hours, count = context.summary["seconds"] / 3600, len(avatar.store)
     cells: list[tuple[str | float | None, ...]] = [
         (f"this run, {name}", round(hours, 3), *(round(ms, 1) for ms in (frames[name], row["pose_ms"], row["draw_ms"])))
         for name, row in rows.items()
@@ -144,7 +144,7 @@ def _snapshots(
         done += taken
         if progress.completes(steps):
             pictures = [drawn(avatar, experiment, frame, progress) for frame in frames]
-            snapshots.append((done, len(avatar.gaussian_store()), pictures))
+            snapshots.append((done, len(avatar.store), pictures))
 
     with TemporaryDirectory(prefix="mien-analysis-") as folder:
         train(sequences, context.avatar.face_model, context.avatar.config, settings, Path(folder) / "run", watch=watch)

@@ -95,7 +95,7 @@ def headgas_case(
 @torch.no_grad()
 def _fill_headgas(avatar: HeadGas, count: int) -> None:
     """Give an avatar small and mostly opaque Gaussians that change with the expression, as training would."""
-    store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    store, generator = avatar.store, torch.Generator().manual_seed(0)
     store.select(torch.arange(count) % len(store))
     store.assign("means", store["means"] + 0.002 * torch.randn(count, 3, generator=generator))
     store.assign("quats", torch.randn(count, 4, generator=generator))
@@ -136,7 +136,7 @@ def mono_case(
 @torch.no_grad()
 def _fill_mono(avatar: MonoGaussianAvatar, count: int) -> None:
     """Put points near the vertices, and let attributes differ from point to point, as after training."""
-    store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    store, generator = avatar.store, torch.Generator().manual_seed(0)
     store.assign("means", avatar.face_model.head_vertices(avatar.canonical_face())[0])
     store.select(torch.arange(count) % len(store))
     store.assign("means", store["means"] + 0.002 * torch.randn(count, 3, generator=generator))

@@ -171,7 +171,7 @@ def default_case(
 
 def _grow(state: TrainingState, count: int) -> None:
     """Grow an avatar as density control would: several small Gaussians per triangle, all of which have features."""
-    store, generator = state.avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    store, generator = state.avatar.store, torch.Generator().manual_seed(0)
     opened = (store["opacity_logits"].detach() < 0).nonzero()[:, 0]  # Fills are opaque from the start.
     store.append(opened[torch.arange(max(0, count - len(store))) % len(opened)])
     trained = (store["opacity_logits"].detach() < 0).nonzero()[:, 0]

@@ -126,7 +126,7 @@ def empty_statistics(count: int) -> dict[str, Tensor]:
 
 def _grow(avatar: Avatar, count: int) -> None:
     """Grow an avatar as density control would: several Gaussians per triangle, small and mostly opaque."""
-    store, generator = avatar.gaussian_store(), torch.Generator().manual_seed(0)
+    store, generator = avatar.store, torch.Generator().manual_seed(0)
     faces = len(store)
     store.select(torch.arange(count) % faces)
     store.assign("means", 0.5 * torch.randn(count, 3, generator=generator))

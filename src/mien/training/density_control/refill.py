@@ -5,8 +5,8 @@ The loop, with the names of `RefillSettings`:
 1. In every step, after the backward pass, `observe` notes the highest opacity that each Gaussian has had. The method
    can say otherwise how visible a Gaussian is (`observed`).
 2. After the steps at `times`, `adapt` runs a round:
-   - Prune: a Gaussian goes if its opacity stayed below `prune_opacity` in all views since the last round. The method
-     can judge by another opacity (`judged_opacities`) and can forbid prunes (`may_prune`). One Gaussian always stays.
+   - Prune: a Gaussian goes if its opacity stayed below `prune_opacity` in all views since the last round. One Gaussian
+     always stays.
    - Refill: if fewer Gaussians are left than the round's target, children of random survivors are added up to it. The
      method's hook `refill` says in what they differ from their parents.
    - The statistics start again.
@@ -50,9 +50,7 @@ class RefillStrategy(DensityStrategy):
         ]
         if not due:
             return False
-        judged, may_prune, seen = self._density.judged_opacities, self._density.may_prune, self._highest_opacities
-        unseen = (seen if judged is None else judged(store, seen)) < settings.prune_opacity
-        kept = ~(unseen if may_prune is None else may_prune(store, unseen))
+        kept = ~(self._highest_opacities < settings.prune_opacity)
         if not bool(kept.any()):
             # Without any Gaussian there is no parent for a refill, so keep the one that was most visible.
             kept[self._highest_opacities.argmax()] = True

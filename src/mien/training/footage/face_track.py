@@ -1,7 +1,7 @@
 """FaceTrack: the face parameters of all timesteps during training, tuned frame by frame if settings ask for it."""
 
 from collections.abc import Sequence as Items
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,12 +20,6 @@ what follows smaller turns, which explain less. Measured: 0 is as good on three 
 take all corrections from a head that hardly turns."""
 
 _FIELDS = ("expression", "joints", "head_rotation", "head_translation")
-
-
-@dataclass(frozen=True, eq=False)
-class _Row:
-    face: FaceParams
-    groups: list[ParameterGroup]
 
 
 class FaceTrack:
@@ -57,7 +51,7 @@ class FaceTrack:
         self._trained = list(range(len(face)) if trained is None else trained)
         self._away = turns_from_mean(self._start, self._trained) if away is None else away
         self._sequence = torch.arange(len(self._lengths)).repeat_interleave(torch.tensor(self._lengths))
-        self._rows: dict[int, _Row] = {}
+        self._rows: dict[int, tuple[FaceParams, list[ParameterGroup]]] = {}
         names = _FIELDS if tuning.enabled else ()
         self._moments = {name: Moments.zeros(self._fields[name]) for name in names}
         for moments in self._moments.values():
@@ -70,7 +64,7 @@ class FaceTrack:
 
     def face(self, index: int) -> FaceParams:
         """One timestep. With tuning, its tensors are leaves that share memory with the track."""
-        return self._row(index).face
+        return self._row(index)[0]
 
     def trained_face(self) -> FaceParams:
         """The timesteps that training uses, as they were tracked."""
@@ -78,7 +72,7 @@ class FaceTrack:
 
     def parameter_groups(self, index: int) -> list[ParameterGroup]:
         """The parameter groups of one timestep. Their tensors are those of `face(index)`."""
-        return self._row(index).groups
+        return self._row(index)[1]
 
     def confine(self, index: int) -> None:
         """Bring the expression of one timestep back within its bounds, if settings ask for it."""
@@ -109,22 +103,19 @@ class FaceTrack:
         self._fields["head_rotation"][seen] = steady.head_rotation
         self._fields["head_translation"][seen] = steady.head_translation
 
-    def _row(self, index: int) -> "_Row":
+    def _row(self, index: int) -> tuple[FaceParams, list[ParameterGroup]]:
         # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.
         if index not in self._rows:
-            self._rows[index] = self._make_row(index)
+            rows = {name: tensor[index : index + 1] for name, tensor in self._fields.items()}
+            if self._tuning.enabled:
+                rows = {name: row.detach().requires_grad_() for name, row in rows.items()}
+            groups = []
+            for name, state in self._moments.items():
+                row = Moments(state.first[index : index + 1], state.second[index : index + 1], state.step[index])
+                rate, begin = Rate(getattr(self._tuning, name)), self._tuning.begin
+                groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}, begin=begin))
+            self._rows[index] = replace(self._start, **rows), groups
         return self._rows[index]
-
-    def _make_row(self, index: int) -> "_Row":
-        rows = {name: tensor[index : index + 1] for name, tensor in self._fields.items()}
-        if self._tuning.enabled:
-            rows = {name: row.detach().requires_grad_() for name, row in rows.items()}
-        groups = []
-        for name, state in self._moments.items():
-            row = Moments(state.first[index : index + 1], state.second[index : index + 1], state.step[index])
-            rate, begin = Rate(getattr(self._tuning, name)), self._tuning.begin
-            groups.append(ParameterGroup(f"face.{name}", {name: rows[name]}, rate, {name: row}, begin=begin))
-        return _Row(replace(self._start, **rows), groups)
 
     def params(self) -> FaceParams:
         """The current parameters of all timesteps. Timesteps without training get corrections from their neighbours.

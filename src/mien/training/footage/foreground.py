@@ -10,7 +10,7 @@ the result of the first.
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, UInt8
+from jaxtyping import Float, Int, Int32, UInt8
 
 _FOREGROUND_WINDOWS = (1 / 11, 1 / 73)
 """Sides of the windows of both passes, as shares of the picture's longer side: 45 and 7 pixels of 500. Two passes are
@@ -33,7 +33,7 @@ def foreground_colors(image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray
 def soft_colors(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"]
 ) -> tuple[Int32[np.ndarray, " k"], UInt8[np.ndarray, "k 3"]]:
-    """Return the indices of soft pixels (`soft_pixels`), row by row, and their colours in `foreground_colors`."""
+    """Return the indices, by rows, of pixels neither empty nor solid, and their colours in `foreground_colors`."""
     left, top, width, height = cv2.boundingRect(matte)
     if width == 0:
         return np.zeros(0, np.int32), np.zeros((0, 3), np.uint8)
@@ -60,11 +60,6 @@ def soft_colors(
     soft = weight < _FOREGROUND_SOLID
     row, column = np.divmod(place[soft], filmed.shape[1])
     return ((row + low[1]) * image.shape[1] + column + low[0]).astype(np.int32), colors[soft]
-
-
-def soft_pixels(matte: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels whose colours `foreground_colors` estimates: neither empty nor solid."""
-    return (matte > 0) & (matte < _FOREGROUND_SOLID)
 
 
 def _mean(

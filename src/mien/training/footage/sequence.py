@@ -77,25 +77,6 @@ def composite(
     return picture
 
 
-def composite_reference(
-    image: UInt8[np.ndarray, "h w 3"],
-    matte: UInt8[np.ndarray, "h w"],
-    background: UInt8[np.ndarray, " 3"],
-    box: Box | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """`composite` in numpy, with the same integers."""
-    left, top, width, height = box or (0, 0, *matte.shape[::-1])
-    inside = (slice(top, top + height), slice(left, left + width))
-    alpha = matte[inside][..., None].astype(np.uint16)
-    mixed = image[inside] * alpha + background.astype(np.uint16) * (255 - alpha)
-    # Rounded division by 255 in integers, exact for 16 bits.
-    mixed += 128
-    picture = np.empty((*matte.shape, 3), np.uint8)
-    picture[:] = background
-    picture[inside] = (mixed + (mixed >> 8)) >> 8
-    return picture
-
-
 @dataclass(frozen=True, eq=False)
 class Target:
     """The picture that a rendering is compared with."""

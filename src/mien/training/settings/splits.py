@@ -96,25 +96,17 @@ class HeldOut(NamedTuple):
     """None if captures have to be read first."""
 
 
-def _all(given: Recordings) -> list[str]:
-    return list(given.sequences)
-
-
-def _no_timesteps(count: int, folder: Path | None) -> Sequence[tuple[int, int]]:
-    return ()
-
-
 @dataclass(frozen=True)
 class SplitRule:
     """A rule that says what is held out."""
 
-    timesteps: Callable[[int, Path | None], Sequence[tuple[int, int]]] = _no_timesteps
+    timesteps: Callable[[int, Path | None], Sequence[tuple[int, int]]] = lambda count, folder: ()
     """(number of timesteps, the sequence's folder) -> ranges of held-out timesteps."""
     held_out: Callable[[Recordings], HeldOut | None] | None = None
     """Whole sequences and cameras that are held out; None before the captures were read.
 
     Without it, the split leaves them to --hold-out."""
-    used: Callable[[Recordings], list[str]] = _all
+    used: Callable[[Recordings], list[str]] = lambda given: list(given.sequences)
     """The names of the sequences that a run uses."""
     of_cameras: bool = False
     """Whether `held_out` always names a sequence or a camera."""

@@ -32,7 +32,7 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
     The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it (3D Gaussian Splatting,
     equation 3). It is the derivative of the picture by the Gaussian's colour. A view is one timestep and a camera.
     """
-    most = torch.zeros(len(avatar.gaussian_store()), device=avatar.face_model.template.device)
+    most = torch.zeros(len(avatar.store), device=avatar.face_model.template.device)
     for face, camera in views:
         with torch.no_grad():
             gaussians = avatar.pose(face).gaussians.timestep(0)

@@ -49,7 +49,7 @@ class WholeHead:
 
         `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled.
         """
-        surface = avatar.surface()
+        surface = avatar.extras.surface
         assert surface is not None
         self.unseen, self.coverage = unseen, coverage
         self.fills = unseen is not None and unseen.fills
@@ -157,7 +157,7 @@ def prepare_whole_head(
     Returns a function that makes the whole head on the device of a tensor, once the avatar is there. It is None for
     avatars whose Gaussians are bound to no surface.
     """
-    surface, model = avatar.surface(), avatar.face_model
+    surface, model = avatar.extras.surface, avatar.face_model
     if surface is None:
         return None
     filled, unseen, coverage, interior = fills_sides(footage.frames, settings, bound=True), None, None, None

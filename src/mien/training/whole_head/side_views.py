@@ -191,7 +191,7 @@ def _held_back(avatar: Avatar, posed: Posed, compared: Bool[Tensor, " f"]) -> Fl
     The mesh is a better guess there. Filmed expressions come together, so without this cost, raising one of them alone
     also brings the shadows of the others.
     """
-    surface = avatar.surface()
+    surface = avatar.extras.surface
     penalty = None if surface is None else surface.change_penalty(posed.aux, compared.to(surface.triangles().device))
     return 0.0 if penalty is None else _RAISED_CHANGE_WEIGHT * penalty
 

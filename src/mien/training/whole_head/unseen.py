@@ -97,7 +97,7 @@ class Unseen:
         filled_in = self.filled_in(surface)
         if filled_in is None:
             return
-        store = avatar.gaussian_store()
+        store = avatar.store
         gradients = [own for own in (store[name].grad for name in store.trained) if own is not None]
         gradients += [own for own in (rendering.means2d_offset.grad for rendering in renderings) if own is not None]
         factored = [own for group in avatar.parameter_groups() for own in group.factored.values()]
