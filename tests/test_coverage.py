@@ -19,7 +19,6 @@ from mien.face.head_parts import head_parts
 from mien.render import rasterize
 from mien.runtime.baked import Filmed
 from mien.training import train
-from mien.training.density_control import density_strategy
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
 from mien.training.footage.filmed import (
     FILE,
@@ -32,6 +31,7 @@ from mien.training.footage.filmed import (
 )
 from mien.training.footage.frames import Footage, training_frames
 from mien.training.footage.sequence import Sequence
+from mien.training.trainer import density_strategy
 from mien.training.whole_head.head import prepare_whole_head
 from mien.training.whole_head.unseen import UNSEEN_CONFIDENCE, Unseen, drawn_at_height, spare_fills, unseen_of
 from plain_settings import plain_gaussian_avatars, plain_run
