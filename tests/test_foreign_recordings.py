@@ -13,7 +13,7 @@ from mien.capture.cameras.calibration import CalibratedCamera, match_sources, re
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
-from mien.disk.inside import listed
+from mien.disk.reading import listed
 from mien.disk.workspace import Workspace
 from mien.driving.blendshape_json import read_blendshape_json
 from mien.driving.live_link_face import read_live_link_face

@@ -19,7 +19,7 @@ from mien.capture import read_capture
 from mien.capture.frame_files import CacheWriter, FrameLayout, FrameWriter
 from mien.cli import main
 from mien.disk.files import file_digest, read_tensors, write_tensors
-from mien.disk.inside import check_tree, inside, is_plain_name, remove_tree
+from mien.disk.reading import check_tree, inside, is_plain_name, remove_tree
 from mien.disk.workspace import Workspace, check_new_workspace, open_workspace
 from mien.evaluation import evaluate
 from mien.evaluation.experiment import Frame

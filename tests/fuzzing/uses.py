@@ -31,7 +31,7 @@ from mien.datasets.dataset import TrainedAvatar
 from mien.datasets.registry import datasets, recognised
 from mien.datasets.writing import write_sequence
 from mien.disk.files import read_tensors
-from mien.disk.inside import is_one_line
+from mien.disk.reading import is_one_line
 from mien.disk.workspace import Workspace, open_workspace
 from mien.driving import drive
 from mien.driving.blendshape_json import read_blendshape_json

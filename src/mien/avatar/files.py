@@ -10,10 +10,10 @@ from torch import Tensor
 from mien.avatar.avatar import Avatar
 from mien.avatar.methods import method_named, method_of
 from mien.disk.config import decode, encode, for_loading
-from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
-from mien.disk.inside import check_subtrees, check_tree
+from mien.disk.files import file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.disk.limits import MAX_NUMBER
 from mien.disk.locks import read_beside_writers
+from mien.disk.reading import check_subtrees, check_tree, expect_whole
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.loading import load_face_model, read_face_model, read_landmarks, write_face_model

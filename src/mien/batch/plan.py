@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from mien.disk.config import Range, decode
-from mien.disk.files import expect_whole, read_json, remove_leftovers, write_atomically, write_json
-from mien.disk.inside import check_unlinked, inside
+from mien.disk.files import read_json, remove_leftovers, write_atomically, write_json
 from mien.disk.locks import BeingWrittenError, hold
+from mien.disk.reading import check_unlinked, expect_whole, inside
 from mien.errors import UserError
 
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)

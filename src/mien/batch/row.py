@@ -26,8 +26,8 @@ from mien.batch.plan import WORKSPACE, Batch, Row, State
 from mien.batch.store import fetched
 from mien.disk.config import decode
 from mien.disk.files import write_atomically
-from mien.disk.inside import open_to_append, open_to_read
 from mien.disk.locks import BeingWrittenError, hold
+from mien.disk.reading import open_to_append, open_to_read
 from mien.disk.workspace import Workspace
 from mien.errors import CannotWriteError, UserError
 from mien.machine.progress import current_stage

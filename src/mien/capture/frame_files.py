@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.disk.files import read_json, write_json
-from mien.disk.inside import drop_if_shared, open_new, open_to_change, remove_tree
 from mien.disk.locks import BeingWrittenError, hold
+from mien.disk.reading import drop_if_shared, open_new, open_to_change, remove_tree
 from mien.errors import CannotWriteError, UserError
 from mien.machine.progress import progress_bar
 from mien.media.picture_files import decode_png, encode_picture, map_pictures, write_at

@@ -37,8 +37,8 @@ from mien.capture.quality import frame_rate, pace_report
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, check_room, partial_folder, read_capture
 from mien.disk.files import cannot_write, file_digest, read_json, write_json
-from mien.disk.inside import check_tree, has_other_names, remove_tree
 from mien.disk.locks import hold
+from mien.disk.reading import check_tree, has_other_names, remove_tree
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.terminal import plain_name

@@ -26,7 +26,7 @@ from mien.capture.person.survey import Survey, read_saved
 from mien.capture.quality import MEASURES, FrameQuality, measure_face, quality_report, relative_quality
 from mien.capture.store import finish_capture
 from mien.disk.files import write_arrays
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import brought_to

@@ -24,10 +24,10 @@ from mien.capture.frame_files import (
 )
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.quality import FrameQuality
-from mien.disk.files import cannot_write, expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
-from mien.disk.inside import check_tree, is_one_line, remove_tree
+from mien.disk.files import cannot_write, read_arrays, read_json, replace_folder, write_arrays, write_json
 from mien.disk.limits import camera_fault, checked_side, checked_whole, is_moderate
 from mien.disk.locks import read_beside_writers
+from mien.disk.reading import check_tree, expect_whole, is_one_line, remove_tree
 from mien.errors import UserError
 from mien.machine.progress import progress_bar, say
 from mien.machine.terminal import counted

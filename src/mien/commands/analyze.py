@@ -43,7 +43,7 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.disk.inside import check_subtrees
+        from mien.disk.reading import check_subtrees
 
         AnalysisOptions(self.steps, self.seconds).check()
         workspace = self._workspace()

@@ -16,8 +16,7 @@ from mien.batch.store import is_url
 from mien.commands import create, train
 from mien.commands.parsing import options_of, parse_options, with_defaults
 from mien.commands.train_options import check_method
-from mien.disk.inside import is_plain_name, listed
-from mien.disk.reading import parse_json, read_bytes
+from mien.disk.reading import is_plain_name, listed, parse_json, read_bytes
 from mien.disk.tables import table_rows, text_of, with_point
 from mien.disk.workspace import check_no_workspace
 from mien.errors import UserError

@@ -45,7 +45,7 @@ class Make:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.disk.inside import check_subtrees
+        from mien.disk.reading import check_subtrees
 
         self._settings().check()
         if self.out.suffix.lower() != ".html":

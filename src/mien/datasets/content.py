@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mien.disk.inside import is_one_line
 from mien.disk.limits import MAX_NUMBER
-from mien.disk.reading import open_ordinary, parse_json, read_bytes
+from mien.disk.reading import is_one_line, open_ordinary, parse_json, read_bytes
 from mien.errors import UserError
 from mien.face.models.npz import parse_npy, read_npz, readable
 

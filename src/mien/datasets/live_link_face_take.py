@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, sniff
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
 from mien.datasets.nersemble import frames_in
-from mien.disk.inside import listed
-from mien.disk.reading import read_bytes
+from mien.disk.reading import listed, read_bytes
 from mien.errors import UserError
 from mien.face.models.npz import readable
 

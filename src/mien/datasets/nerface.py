@@ -23,7 +23,7 @@ from mien.datasets.content import (
     stacked_poses,
 )
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
-from mien.disk.inside import listed
+from mien.disk.reading import listed
 from mien.errors import UserError
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ import numpy as np
 
 from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, numbers, read_object, rotation_part
 from mien.datasets.dataset import Clip, Dataset, Findings, Footage, ReadSequence
-from mien.disk.inside import is_plain_name
+from mien.disk.reading import is_plain_name
 from mien.errors import UserError
 
 if TYPE_CHECKING:

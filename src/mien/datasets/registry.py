@@ -15,7 +15,7 @@ from mien.datasets.nerface import NERFACE
 from mien.datasets.nersemble import NERSEMBLE
 from mien.datasets.nersemble_benchmark import NERSEMBLE_BENCHMARK
 from mien.datasets.vhap import VHAP
-from mien.disk.inside import listed
+from mien.disk.reading import listed
 from mien.errors import UserError
 from mien.plugins import plugin, warn, with_plugins
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, scalars, sniff, stacked_poses
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
-from mien.disk.inside import is_plain_name
+from mien.disk.reading import is_plain_name
 from mien.errors import UserError
 
 if TYPE_CHECKING:

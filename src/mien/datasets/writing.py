@@ -9,7 +9,7 @@ from mien.capture.store import read_capture, write_capture
 from mien.datasets.content import REMEDY
 from mien.datasets.dataset import Dataset, FilmedSequence, TrackedSequence
 from mien.disk.files import replace_folder, write_arrays
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.tracking.files import write_tracking

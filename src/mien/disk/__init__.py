@@ -1,5 +1,4 @@
-"""Files on disk: `reading` and `limits` bound what is read, and `files` writes whole files or none.
+"""Files on disk: `reading` is the door for what is read, `limits` checks its content, and `files` writes whole files.
 
-`inside` follows no link. `config` has settings with their ranges, `tables` reads csv, `locks` says who is at work,
-and `workspace` has the paths.
+`config` has settings with their ranges, `tables` reads csv, `locks` says who is at work, and `workspace` has the paths.
 """

@@ -19,9 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from mien.disk.inside import open_new, remove_tree
-from mien.disk.reading import expect_whole as expect_whole
-from mien.disk.reading import open_ordinary, parse_json, read_bytes
+from mien.disk.reading import open_new, open_ordinary, parse_json, read_bytes, remove_tree
 from mien.errors import CannotWriteError, UserError
 
 if TYPE_CHECKING:

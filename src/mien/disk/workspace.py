@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mien.disk.inside import check_subtrees, inside
+from mien.disk.reading import check_subtrees, inside
 from mien.errors import UserError
 
 COMPARED = "compare-"

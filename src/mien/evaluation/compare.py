@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mien.disk.files import expect_whole
+from mien.disk.reading import expect_whole
 from mien.errors import UserError
 from mien.evaluation.metrics_file import (
     BASELINE_NAMES,

@@ -9,8 +9,8 @@ from typing import Any
 
 from mien.disk.config import check_ranges
 from mien.disk.files import file_digest, write_json
-from mien.disk.inside import check_tree
 from mien.disk.locks import hold
+from mien.disk.reading import check_tree
 from mien.errors import UserError
 from mien.evaluation.cross import cross_reenactment
 from mien.evaluation.dataset_protocols import check_lpips, dataset_protocol

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mien.camera import Box
 from mien.disk.files import read_json, write_json
-from mien.disk.inside import listed
+from mien.disk.reading import listed
 from mien.errors import UserError
 from mien.evaluation.scoring import (
     PIXELS,

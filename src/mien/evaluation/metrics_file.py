@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mien.disk.files import expect_whole, read_json
+from mien.disk.files import read_json
+from mien.disk.reading import expect_whole
 
 FORMAT, VERSION = "mien.metrics", 1
 REMEDY = "delete this file, not its folder, and run `mien evaluate` again"

@@ -19,8 +19,7 @@ from mien.avatar.avatar import frozen
 from mien.avatar.settings import FaceTuning, Progress
 from mien.disk.config import Range
 from mien.disk.files import write_atomically
-from mien.disk.inside import open_to_append
-from mien.disk.reading import parse_json, read_bytes
+from mien.disk.reading import open_to_append, parse_json, read_bytes
 from mien.evaluation.baselines import Baselines, look_at_trained, make_baselines
 from mien.evaluation.dataset_protocols import dataset_protocol
 from mien.evaluation.experiment import (

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mien.disk.files import expect_whole, write_atomically
+from mien.disk.files import write_atomically
+from mien.disk.reading import expect_whole
 from mien.evaluation import report_sections as sections
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.living import FILM, Living

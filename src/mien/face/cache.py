@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from mien.disk.files import check_writable
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import say
 

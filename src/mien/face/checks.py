@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from mien.disk.inside import is_one_line
 from mien.disk.limits import MAX_NUMBER, skeleton_fault
+from mien.disk.reading import is_one_line
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mien.disk.files import read_json
-from mien.disk.inside import is_one_line
+from mien.disk.reading import is_one_line
 from mien.errors import UserError
 from mien.face.cache import cache_folder
 from mien.plugins import named

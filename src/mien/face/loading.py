@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from mien.disk.files import expect_whole, read_json, read_tensors, write_atomically, write_json, write_tensors
-from mien.disk.inside import is_plain_name
+from mien.disk.files import read_json, read_tensors, write_atomically, write_json, write_tensors
 from mien.disk.limits import are_indices, is_moderate
-from mien.disk.reading import parse_json, read_bytes
+from mien.disk.reading import expect_whole, is_plain_name, parse_json, read_bytes
 from mien.errors import UserError
 from mien.face.checks import AXES, check_face_model
 from mien.face.listing import (

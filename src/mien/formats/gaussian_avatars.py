@@ -22,8 +22,8 @@ from mien.avatar.files import overwrite
 from mien.avatar.gaussian_avatars.settings import as_published
 from mien.avatar.methods import METHODS
 from mien.disk.files import cannot_write
-from mien.disk.inside import open_to_read
 from mien.disk.limits import MAX_NUMBER, is_moderate
+from mien.disk.reading import open_to_read
 from mien.errors import UserError
 from mien.face.loading import read_face_model, read_landmarks, write_face_model
 from mien.face.model import FaceModel

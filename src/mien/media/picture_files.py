@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mien.disk.files import cannot_write, write_atomically
-from mien.disk.inside import open_to_read
+from mien.disk.reading import open_to_read
 from mien.errors import UserError
 from mien.machine import system
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mien.disk.inside import listed
+from mien.disk.reading import listed
 from mien.errors import UserError
 from mien.media.color_correction import ColorCorrection
 from mien.media.decoding import check_file_size, decode_picture, may_have_alpha

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 
 from mien.capture.store import read_capture
-from mien.disk.files import expect_whole, read_tensors, write_tensors
-from mien.disk.inside import remove_tree
+from mien.disk.files import read_tensors, write_tensors
 from mien.disk.locks import hold
+from mien.disk.reading import expect_whole, remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.params import FaceParams

@@ -5,8 +5,7 @@ from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Any
 
-from mien.disk.files import expect_whole
-from mien.disk.inside import check_tree
+from mien.disk.reading import check_tree, expect_whole
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.evaluation.compare import Comparison, compare_runs

@@ -26,7 +26,7 @@ from mien.datasets.submission import (
 )
 from mien.disk.config import decode
 from mien.disk.files import replace_folder
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.params import FaceParams

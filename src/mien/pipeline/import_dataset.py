@@ -19,8 +19,8 @@ from mien.capture.settings import CaptureSettings
 from mien.datasets.dataset import Dataset, Findings, Footage, ReadSequence, TrackedSequence, TrainedAvatar
 from mien.datasets.writing import OVERLAY, write_sequence
 from mien.disk.files import write_atomically
-from mien.disk.inside import inside, remove_tree
 from mien.disk.locks import check_free, hold
+from mien.disk.reading import inside, remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.machine.progress import say

@@ -11,7 +11,7 @@ from typing import Literal
 from mien.capture.settings import CaptureSettings
 from mien.disk.config import Range
 from mien.disk.files import file_digest
-from mien.disk.inside import is_plain_name
+from mien.disk.reading import is_plain_name
 from mien.disk.workspace import check_no_workspace, is_workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.terminal import plain_name

@@ -14,8 +14,8 @@ import torch
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture, read_capture_hash
 from mien.disk.files import read_json, replace_folder, write_atomically, write_json
-from mien.disk.inside import remove_tree
 from mien.disk.locks import WAIT, hold
+from mien.disk.reading import remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image

@@ -11,8 +11,8 @@ from typing import Literal
 from mien.capture.store import read_capture, read_capture_hash
 from mien.datasets.writing import OVERLAY
 from mien.disk.files import remove_leftovers
-from mien.disk.inside import remove_tree
 from mien.disk.locks import hold
+from mien.disk.reading import remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.face.checks import check_face_params

@@ -7,8 +7,8 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
-from mien.disk.inside import is_one_line
 from mien.disk.limits import MAX_NUMBER, are_indices, camera_fault, is_moderate, rigid_fault, skeleton_fault
+from mien.disk.reading import is_one_line
 from mien.errors import UserError
 from mien.runtime.baked import (
     AttributeNetwork,

@@ -15,8 +15,8 @@ import numpy as np
 import safetensors
 
 from mien.disk.config import decode
-from mien.disk.files import check_writable, expect_whole, read_safetensors, write_arrays
-from mien.disk.reading import parse_json
+from mien.disk.files import check_writable, read_safetensors, write_arrays
+from mien.disk.reading import expect_whole, parse_json
 from mien.errors import UserError
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.checks import check

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from mien.camera import Camera
 from mien.capture.capture import Capture
-from mien.disk.files import expect_whole, file_digest, read_json, read_tensors, write_json, write_tensors
-from mien.disk.inside import check_tree, is_one_line
+from mien.disk.files import file_digest, read_json, read_tensors, write_json, write_tensors
 from mien.disk.limits import MAX_NUMBER, camera_fault
 from mien.disk.locks import read_beside_writers
+from mien.disk.reading import check_tree, expect_whole, is_one_line
 from mien.errors import UserError
 from mien.face.params import FaceParams
 from mien.tracking.tracking import PARTS, Appearance, Tracking

@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mien.disk.files import expect_whole, read_arrays, read_json, replace_folder, write_arrays, write_json
-from mien.disk.inside import check_tree, open_new, remove_tree
+from mien.disk.files import read_arrays, read_json, replace_folder, write_arrays, write_json
 from mien.disk.limits import checked_side
 from mien.disk.locks import read_beside_writers
+from mien.disk.reading import check_tree, expect_whole, open_new, remove_tree
 from mien.errors import UserError
 from mien.media.picture_files import PictureStack, decode_png, encode_picture
 from mien.tracking.scoring import Scoring

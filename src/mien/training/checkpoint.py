@@ -10,7 +10,8 @@ from mien.adam import FactoredMoments
 from mien.avatar.avatar import Avatar
 from mien.avatar.files import overwrite
 from mien.avatar.store import Moments
-from mien.disk.files import expect_whole, read_tensors, write_tensors
+from mien.disk.files import read_tensors, write_tensors
+from mien.disk.reading import expect_whole
 from mien.errors import UserError
 from mien.machine.progress import say
 from mien.machine.system import peak_memory_mb

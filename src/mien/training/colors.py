@@ -22,7 +22,8 @@ from mien.adam import Moments
 from mien.avatar.avatar import ParameterGroup
 from mien.avatar.settings import Rate
 from mien.capture.quality import is_light_changing
-from mien.disk.files import expect_whole, read_tensors
+from mien.disk.files import read_tensors
+from mien.disk.reading import expect_whole
 from mien.errors import UserError
 from mien.gaussians import Rendering
 from mien.training.footage.frames import Frame

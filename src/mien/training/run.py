@@ -21,9 +21,9 @@ from mien.avatar.methods import method_of
 from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.disk.config import encode
-from mien.disk.files import expect_whole, read_json, read_tensors, write_json, write_tensors
-from mien.disk.inside import check_tree, is_plain_name
+from mien.disk.files import read_json, read_tensors, write_json, write_tensors
 from mien.disk.locks import WAIT, check_free
+from mien.disk.reading import check_tree, expect_whole, is_plain_name
 from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.model import FaceModel

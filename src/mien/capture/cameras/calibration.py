@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.camera import Camera
-from mien.disk.inside import is_plain_name, listed
+from mien.disk.reading import is_plain_name, listed
 from mien.errors import UserError
 from mien.media.color_correction import ColorCorrection, correction_of_entry
 from mien.media.lens import Lens, lens_of_entry

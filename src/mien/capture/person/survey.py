@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Int64, UInt8
 
 from mien.capture.person.backend import DetectorChoice
 from mien.capture.person.faces import MAX_FACES, FaceFinder
-from mien.disk.files import expect_whole, read_arrays, write_arrays
+from mien.disk.files import read_arrays, write_arrays
+from mien.disk.reading import expect_whole
 from mien.errors import UserError
 from mien.machine.progress import Advance, progress_bar, say
 from mien.media.display import same_shape

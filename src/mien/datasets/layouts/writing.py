@@ -10,7 +10,7 @@ from mien.camera import Box
 from mien.datasets.layouts.filmed import Filmed
 from mien.datasets.layouts.layout import Layout, Written, check_new_folder
 from mien.disk.files import cannot_write, replace_folder
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
 from mien.machine.terminal import counted

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien.disk.inside import listed
-from mien.disk.reading import read_bytes
+from mien.disk.reading import listed, read_bytes
 from mien.errors import UserError
 from mien.face.chart import find_outside, unwrap
 from mien.face.model import EYE_BACK, FaceModel

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from mien.disk.inside import inside
-from mien.disk.reading import read_bytes
+from mien.disk.reading import inside, read_bytes
 from mien.evaluation.page_parts import Card, Cell, DataTable, video_of
 from mien.evaluation.page_parts import Picture as PagePicture
 from mien.media.picture_files import write_png

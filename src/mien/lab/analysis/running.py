@@ -23,9 +23,9 @@ from mien.avatar.files import load_avatar
 from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
 from mien.disk.config import decode, encode
-from mien.disk.files import expect_whole, file_digest, read_json, write_atomically, write_json
-from mien.disk.inside import check_tree, inside
+from mien.disk.files import file_digest, read_json, write_atomically, write_json
 from mien.disk.locks import hold
+from mien.disk.reading import check_tree, expect_whole, inside
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment
 from mien.evaluation.load import load_experiments

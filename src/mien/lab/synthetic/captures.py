@@ -18,7 +18,7 @@ from mien.capture.capture import Capture
 from mien.capture.person.faces import LANDMARKS, LandmarkDetector
 from mien.capture.store import write_capture
 from mien.disk.files import read_json, write_json
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.face.loading import face_model_edition
 from mien.lab.synthetic.recipe import SyntheticRecipe

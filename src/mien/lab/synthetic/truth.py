@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien.disk.files import expect_whole, read_arrays, read_json, write_arrays, write_json
+from mien.disk.files import read_arrays, read_json, write_arrays, write_json
+from mien.disk.reading import expect_whole
 from mien.lab.synthetic.anatomy import CHIN, EAR, FOREHEAD_TOP, Anatomy, measure_anatomy
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.machine import exact

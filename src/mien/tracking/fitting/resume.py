@@ -9,7 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from mien.disk.files import read_tensors, write_tensors
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import say
 

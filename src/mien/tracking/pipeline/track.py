@@ -9,7 +9,7 @@ import torch
 
 from mien.capture.capture import Capture
 from mien.capture.person.backend import detector_of
-from mien.disk.inside import remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.machine.progress import say

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
-from mien.disk.files import expect_whole, read_tensors, write_tensors
+from mien.disk.files import read_tensors, write_tensors
+from mien.disk.reading import expect_whole
 from mien.face.model import FaceModel
 from mien.render.camera_paths import turned_camera
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mien.disk.files import expect_whole, read_json, write_json
+from mien.disk.files import read_json, write_json
+from mien.disk.reading import expect_whole
 from mien.errors import UserError
 from mien.training.settings import Split, TrainSettings
 

@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.disk.config import Range, check_ranges, decode
-from mien.disk.files import expect_whole, read_json, write_json
-from mien.disk.inside import listed
-from mien.disk.reading import parse_json, read_bytes
+from mien.disk.files import read_json, write_json
+from mien.disk.reading import expect_whole, listed, parse_json, read_bytes
 from mien.errors import UserError
 from mien.lab.benchmarking.comparing import markdown
 
