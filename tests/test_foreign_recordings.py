@@ -168,7 +168,7 @@ def cameras() -> list[CalibratedCamera]:
     (("2.png", "10.png"), list_images),
     (("00.mp4", "01.mp4"), lambda folder: match_sources([folder], cameras(), folder / "cameras.json")),
     (("ann.mp4", "bob.mov"), lambda folder: [Path(row.steps[0][1]) for row in read_table(folder)]),
-    (("a.png", "b.png"), lambda folder: list(open_pictures(folder).files.values())),
+    (("a.png", "b.png"), lambda folder: [*(open_pictures(folder).files or {}).values()]),
     (("a.obj", "b.obj"), lambda folder: listed(folder, "*.obj")),
 ])  # fmt: skip
 def test_what_systems_leave_is_skipped(tmp_path, names: tuple[str, ...], read: Callable[[Path], list[Path]]) -> None:

@@ -24,9 +24,6 @@ Holds = Literal["pose", "sequence", "avatar", "folder"]
 """What a file of a format holds: Gaussians in one pose, or in many, a whole avatar, or a folder with a whole run."""
 
 
-_ONLY_RUNS = "a file does not have all that this format needs; export its workspace"
-
-
 class Content(ABC):
     """An avatar that is written. A format asks for what it holds, and nothing else is computed."""
 
@@ -47,21 +44,21 @@ class Content(ABC):
     def pose(self) -> "mien.gaussians.Gaussians":
         """Return the Gaussians with the expression that was asked for: the head at the origin, +y up, +z ahead."""
 
+    @abstractmethod
     def poses(self) -> "tuple[Iterator[Content], float] | None":
         """Return the content in the pose of each frame of the motion, and frames per second; None without a motion."""
-        return None
 
+    @abstractmethod
     def motion(self) -> "mien.formats.shared.packed.Motion | None":
         """Return the motion that was asked for, as face parameters with head poses; None without one."""
-        return None
 
+    @abstractmethod
     def mesh(self) -> "mien.formats.glb.MeshModel":
         """Return the person's mesh with its texture coordinates, which only a run has."""
-        raise UserError(_ONLY_RUNS)
 
+    @abstractmethod
     def trained(self) -> "tuple[mien.avatar.avatar.Avatar, mien.face.params.FaceParams]":
         """Return the trained avatar, and the person at all timesteps of its training, which only a run has."""
-        raise UserError(_ONLY_RUNS)
 
 
 @dataclass(frozen=True)

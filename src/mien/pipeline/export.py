@@ -5,12 +5,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mien import runtime
+from mien.errors import UserError
 from mien.formats.format import Content, Format, NoOptions
 from mien.formats.registry import format_of, numbered
 from mien.machine.progress import say
 from mien.runtime.baked import PortableAvatar
 
 if TYPE_CHECKING:
+    import mien.avatar.avatar
+    import mien.face.params
+    import mien.formats.glb
     import mien.gaussians
 
 
@@ -27,6 +31,9 @@ def export(content: Content, out: Path, kind: Format, options: NoOptions) -> Non
         written.append(numbered(out, index))
         kind.write(written[-1], frame, options)
     say(f"{written[0]} ... {written[-1].name}: {len(written)} files")
+
+
+_ONLY_RUNS = "a file does not have all that this format needs; export its workspace"
 
 
 class FileContent(Content):
@@ -59,6 +66,20 @@ class FileContent(Content):
         pose = None if posed.T_world_local is None else torch.from_numpy(posed.T_world_local)
         still = gaussians_of((posed.means, posed.quats, posed.scales, posed.opacities, posed.sh))
         return in_world(replace(still, T_world_local=pose))
+
+    def poses(self) -> None:
+        """A file has no motion."""
+
+    def motion(self) -> None:
+        """A file has no motion."""
+
+    def mesh(self) -> "mien.formats.glb.MeshModel":
+        """Refused."""
+        raise UserError(_ONLY_RUNS)
+
+    def trained(self) -> "tuple[mien.avatar.avatar.Avatar, mien.face.params.FaceParams]":
+        """Refused."""
+        raise UserError(_ONLY_RUNS)
 
     def _posed(self) -> runtime.Gaussians:
         """The Gaussians with the head at the origin."""
