@@ -321,4 +321,4 @@ def test_outputs_follow_the_umask(tmp_path: Path, mask: int, mode: int) -> None:
 
 def test_a_list_of_files_is_no_film(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_text("ffconcat version 1.0\nfile secret.mp4\n")
-    refuses(r"film\.mp4: is a list of files", write_strip, tmp_path / "film.mp4", tmp_path / "a.jpg")
+    refuses(r"film\.mp4: is a playlist, a manifest or a link", write_strip, tmp_path / "film.mp4", tmp_path / "a.jpg")

@@ -128,7 +128,7 @@ VALUES: dict[str, tuple[Row, ...]] = {
         ("training", {"gaussians": "many", "seconds": 1}),
         *((f"{_TAIL}.{place}", value) for place, value in (
             ("psnr", "high"), ("psnr", HUGE), ("ssim", [1]), ("head", None),
-            ("face_params", "guessed"), ("split", {}), ("baselines", [1]),
+            ("split", {}), ("baselines", [1]),
             ("baselines.mesh", {"psnr": 1.0}), ("scored_on", ["clip"]), ("per_frame", GONE),
             ("per_frame.head_psnr", ["x"]), ("perceptual_backbone", [1]),
             ("seconds_per_frame", None),

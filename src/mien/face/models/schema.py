@@ -39,9 +39,9 @@ def check_arrays(
         for size, symbol in zip(array.shape, symbols, strict=False):
             fits = fits and size > 0 and size == (int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size))
         if not fits:
-            wanted = " ".join(str(sizes.get(symbol, symbol)) for symbol in symbols)
+            wanted = ", ".join(str(sizes.get(symbol, symbol)) for symbol in symbols)
             raise UserError(
-                f"{path}: {key!r} has the shape {list(array.shape)} of {array.dtype}, not numbers in [{wanted}]; "
+                f"{path}: {key!r} has the shape {list(array.shape)} of {array.dtype}, not [{wanted}] of numbers; "
                 f"{remedy}"
             )
         check_numbers(path, key, array, remedy)
