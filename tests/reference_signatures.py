@@ -80,7 +80,8 @@ def tiny(reference: ReferenceCapture) -> ReferenceCapture:
         for recipe in reference.sequences
     ]
     views = None if reference.views is None else replace(reference.views, first=1, every=1)
-    return replace(reference, sequences=tuple(small), views=views)
+    # Posed faces are drawn by what draws the sequences.
+    return replace(reference, sequences=tuple(small), views=views, unfilmed=False)
 
 
 def drawn_signatures(reference: ReferenceCapture) -> dict[str, dict[str, list[float]]]:

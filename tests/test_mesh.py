@@ -18,7 +18,6 @@ from mien.render.mesh import (
     interpolate_reference,
     rasterize_mesh,
     render_mesh,
-    sample_texture,
     sh_basis,
     shade,
     vertex_normals,
@@ -158,13 +157,6 @@ def test_bad_input_is_dropped_or_refused():
     assert (rasterize_mesh(vertices, faces[:0], pixel_camera()).face_index == -1).all()
     with pytest.raises(IndexError, match="vertex"):
         rasterize_mesh(vertices, torch.tensor([[0, 1, 7]]), pixel_camera())
-
-
-def test_texture_lookup():
-    texture = torch.arange(12.0).view(3, 4, 1)
-    uv = torch.tensor([[[0.125, 1 - 1 / 6], [0.875, 1 / 6]], [[0.25, 0.5], [-1.0, 2.0]]])
-    expected = torch.tensor([[[0.0], [11.0]], [[4.5], [0.0]]])
-    torch.testing.assert_close(sample_texture(texture, uv), expected)
 
 
 def test_harmonics_are_orthonormal_and_light_is_linear():

@@ -72,6 +72,8 @@ KEYS = {
     "beard": "d19389ae0850b3f4", "long-hair": "69f32fa0a3632a1e",
     "glasses": "cf70d19c2a6ef102", "off-model": "87621466675cf748",
     "mono-sides": "49c0f1a14644d29e", "mono-sides-long-hair": "67640321020edf29",
+    "unfilmed-1": "e7c74fc905ce6dcd", "unfilmed-2": "3e545f881b0723f4", "unfilmed-3": "1b567b42cec879ce",
+    "unfilmed-4": "4b4f809ef2aa33b9", "unfilmed-5": "2965327d86c9a2bd", "unfilmed-6": "739d318670618e73",
 }  # fmt: skip
 """Keys of the references. A change means that figures on the capture cannot be compared any more.
 

@@ -128,7 +128,7 @@ class Quality:
     """
 
     captures: tuple[CaptureName, ...] = ()
-    """Names of reference captures (default: all but ring-16-large, which takes hours)."""
+    """Names of reference captures (default: all but ring-16-large, which takes hours, and unfilmed)."""
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
     steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps. 0 means each capture's own number."""

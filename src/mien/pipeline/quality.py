@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mien.avatar.files import load_avatar
 from mien.capture.settings import CaptureSettings
 from mien.capture.store import read_capture, read_capture_hash
 from mien.disk.files import read_json, replace_folder, write_atomically, write_json
@@ -26,6 +27,7 @@ from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
 from mien.lab.benchmarking.quality import QualityRow, markdown_table, tracking_errors
+from mien.lab.benchmarking.unfilmed import PosedPictures, glasses_masks, score_unfilmed, unfilmed_table
 from mien.lab.benchmarking.unseen_views import (
     Figures,
     SidePictures,
@@ -33,7 +35,8 @@ from mien.lab.benchmarking.unseen_views import (
     score_side_views,
     write_unseen_chart,
 )
-from mien.lab.synthetic.references import REFERENCES, ReferenceCapture, reference_named
+from mien.lab.synthetic.posed_faces import posed_faces
+from mien.lab.synthetic.references import FACES, REFERENCES, TALK, ReferenceCapture, reference_named
 from mien.lab.synthetic.truth import read_truth
 from mien.machine.progress import say
 from mien.machine.terminal import show
@@ -61,7 +64,9 @@ def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: 
     usual = [name for name, reference in REFERENCES.items() if reference.by_default]
     references, rows, strips = [reference_named(name) for name in captures or usual], [], []
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
-        for reference in references:
+        for reference in [one for one in references if one.unfilmed]:
+            show(run_unfilmed(reference, out, method, steps or reference.steps))
+        for reference in [one for one in references if not one.unfilmed]:
             row, strip = _run_reference(reference, out, method, steps or reference.steps)
             rows.append(row)
             strips.append(strip)
@@ -124,13 +129,41 @@ def draw_and_track(
     with times.measured("draw"):
         key = reference.write(drawn)
     with times.measured("capture"):
-        for name in (recipe.name for recipe in reference.sequences):
-            if (video := drawn / name / "video.mp4").is_file():
-                run_capture_stage(workspace, [video], [name], None, CaptureSettings(cuts=False), replace=True)
-            else:
-                _copy_capture(drawn / name / "capture", workspace.sequence_dir(name))
+        _capture(reference, drawn, workspace)
     with times.measured("track"):
         return key, run_tracking_stage(workspace, "anny", TrackingSettings(), overlay="none")
+
+
+def _capture(reference: ReferenceCapture, drawn: Path, workspace: Workspace) -> None:
+    for name in (recipe.name for recipe in reference.sequences):
+        if (video := drawn / name / "video.mp4").is_file():
+            run_capture_stage(workspace, [video], [name], None, CaptureSettings(cuts=False), replace=True)
+        else:
+            _copy_capture(drawn / name / "capture", workspace.sequence_dir(name))
+
+
+def run_unfilmed(reference: ReferenceCapture, out: Path, method: str, steps: int) -> str:
+    """Train on the true tracking of talk, and of all clips, and score both on faces that the talk does not show.
+
+    Returns a table. Writes OUT/NAME-true/runs/RUN/unfilmed.json, and a sheet beside it.
+    """
+    drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
+    say(f"== {reference.name}: {reference.description}")
+    key, names = reference.write(drawn), [recipe.name for recipe in reference.sequences]
+    _capture(reference, drawn, workspace)
+    true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), names)
+    settings = replace(_PRESET.settings_of(method), steps=steps, split="none")
+    scene = reference.scenes()[-1]
+    capture, truth = read_capture(drawn / FACES / "capture"), read_truth(drawn / FACES / "truth")
+    pictures = PosedPictures(tuple(posed_faces(scene.model)), capture.images, truth, glasses_masks(scene))
+    figures = {}
+    for run, trained in ((f"{method}-{steps}", [TALK]), (f"{method}-{steps}-everything", names)):
+        run_training_stage(true, trained, run, _PRESET.config(method), settings)
+        folder = true.run_dir(run)
+        figures[run], sheet = score_unfilmed(load_avatar(folder), pictures, ScoreSettings(perceptual_frames=0))
+        write_png(folder / "unfilmed.png", sheet)
+        write_json(folder / "unfilmed.json", "mien.unfilmed", 1, {"key": key, "regions": figures[run]})
+    return unfilmed_table(reference.name, key, figures)
 
 
 def reference_settings(reference: ReferenceCapture, settings: TrainSettings) -> TrainSettings:

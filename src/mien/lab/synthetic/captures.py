@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +98,7 @@ def scene_key(scene: SyntheticScene) -> str:
     marks = scene.model.landmarks["mediapipe"]  # as read from disk; they place paint and strands
     content = {
         "drawing": DRAWING,
-        "recipe": asdict(scene.recipe),
+        "recipe": scene.recipe.record,
         "seed": scene.seed,
         "motion_seed": scene.motion_seed,
         "face_model": [scene.model.name, face_model_edition(scene.model)],
@@ -150,7 +149,7 @@ def _draw_all(scene: SyntheticScene, folder: Path, inputs: str) -> str:
         "inputs": inputs,
         "seed": scene.seed,
         "motion_seed": scene.motion_seed,
-        "recipe": asdict(recipe),
+        "recipe": recipe.record,
         **scene.extent,
     }
     write_json(folder / _JSON, FORMAT, VERSION, content)

@@ -4,8 +4,8 @@ The order of the file: the script in time, the expressions (speech, smiles and b
 the pose and gaze of the head. Names of expressions are ARKit's.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import numpy as np
@@ -237,6 +237,13 @@ def _euler_matrices(pitch_yaw_roll: Float[np.ndarray, "*b 3"]) -> Float[np.ndarr
     axes = np.eye(3)
     pitch, yaw, roll = (matrix_from_axis_angle(pitch_yaw_roll[..., i, None] * axes[i]) for i in range(3))
     return exact.product(exact.product(yaw, pitch), roll)
+
+
+def with_expressions(model: FaceModel, face: FaceParams, expressions: Sequence[Mapping[str, float]]) -> FaceParams:
+    """Return one timestep with other expressions, by coefficient, one after the other. Coefficients not named are 0."""
+    posed = face[[0] * len(expressions)]
+    rows = [[one.get(name, 0.0) for name in model.expression_names] for one in expressions]
+    return replace(posed, expression=torch.tensor(rows).to(posed.expression))
 
 
 def _drift(random: np.random.Generator, times: np.ndarray, amplitude: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Recipes of synthetic captures: what a capture shows, and the recipes with names."""
 
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from typing import Any, Literal
 
@@ -14,6 +14,8 @@ SIDES: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 """Cameras at the side: azimuth towards the subject's left and elevation above the face, in degrees from the front
 camera."""
+OBLIQUE: dict[str, tuple[float, float]] = {"left-20": (20.0, 0.0)}
+"""The camera that sees posed faces beside the front camera, in the same angles."""
 
 SegmentKind = Literal["still", "speech", "expressions", "turns", "free"]
 
@@ -74,9 +76,11 @@ class SyntheticRecipe:
     """Length of a full beard of strands in metres; 0 for none. It is not part of the face model."""
     off_model: float = 0.0
     """Distance of head shape and expressions from the face model's space: 1 is far, 0 is none."""
-    cameras: Literal["front", "ring", "sides"] = "front"
+    make_up: float = 0.0
+    """Strength of make-up, 0..1: red lips, dark lids and lines of the eyes, filled brows."""
+    cameras: Literal["front", "ring", "sides", "oblique"] = "front"
     """front: one camera in front of the face. ring: `ring_size` calibrated cameras on half a sphere, the first in
-    front. sides: the front camera and those of `SIDES`, calibrated."""
+    front. sides, oblique: the front camera and those of `SIDES` or `OBLIQUE`, calibrated."""
     ring_size: int = 16
     script: tuple[Segment, ...] = ()
     """The script, part by part; it replaces `seconds`. If empty, there is one `free` part."""
@@ -109,7 +113,17 @@ class SyntheticRecipe:
         """Names of the cameras."""
         if self.cameras == "ring":
             return tuple(f"{index:02d}" for index in range(self.ring_size))
-        return ("front", *(SIDES if self.cameras == "sides" else ()))
+        return ("front", *self.angles)
+
+    @property
+    def angles(self) -> dict[str, tuple[float, float]]:
+        """The cameras beside the front camera that stand at fixed angles, by name."""
+        return {"sides": SIDES, "oblique": OBLIQUE}.get(self.cameras, {})
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The recipe for keys. What was added later is left out where it is not used, so that keys stay."""
+        return {name: value for name, value in asdict(self).items() if name != "make_up" or value}
 
 
 RECIPES: dict[str, SyntheticRecipe] = {

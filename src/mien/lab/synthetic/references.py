@@ -7,8 +7,12 @@ from typing import Any
 
 from mien.errors import UserError
 from mien.lab.synthetic.captures import scene_key, write_scene
+from mien.lab.synthetic.posed_faces import posed_faces
 from mien.lab.synthetic.recipe import PEOPLE, Segment, SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
+
+TALK, FACES = "talk", "faces"
+"""The sequence of talk of an `unfilmed` reference, and the folder of the true pictures of its faces."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,8 @@ class ReferenceCapture:
     """Whether `mien bench quality` without names includes it."""
     views: SideViews | None = None
     """True pictures from the side for the protocol `unseen_view`. None if there are none."""
+    unfilmed: bool = False
+    """Whether the protocol `unfilmed` scores it: true pictures of `posed_faces`, which the sequence TALK lacks."""
 
     def scenes(self) -> list[SyntheticScene]:
         """Return the sequences and the side views, not yet drawn. They share the person but not the motion."""
@@ -58,6 +64,11 @@ class ReferenceCapture:
             seen = replace(of.recipe, name=self.views.name, cameras="sides")
             moments = range(self.views.first, of.recipe.timesteps, self.views.every)
             scenes.append(SyntheticScene(seen, self.seed, of.motion_seed, scenes[0], moments))
+        if self.unfilmed:
+            first = scenes[0]
+            seen = replace(first.recipe, name=FACES, cameras="oblique")
+            faces = [*posed_faces(first.model).values()]
+            scenes.append(SyntheticScene(seen, self.seed, first.motion_seed, first, faces=faces))
         return scenes
 
     def write(self, folder: Path) -> str:

@@ -3,8 +3,8 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -14,11 +14,11 @@ from jaxtyping import Float, UInt8
 from mien.camera import Camera, look_at
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.lab.synthetic.motion import generate_motion
+from mien.lab.synthetic.motion import generate_motion, with_expressions
 from mien.lab.synthetic.off_model import bend_off_model
 from mien.lab.synthetic.painter import develop, draw, paint_wall, to_uint8
 from mien.lab.synthetic.posing import HeadPoser, head_pose, landmark_positions, project
-from mien.lab.synthetic.recipe import SIDES, SyntheticRecipe
+from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.subject import Subject, build_subject, pose_subject
 from mien.machine import exact
 from mien.machine.parallel import stream_in_threads
@@ -46,11 +46,13 @@ class SyntheticScene:
         motion_seed: int | None = None,
         same_person: "SyntheticScene | None" = None,
         moments: Sequence[int] | None = None,
+        faces: Sequence[Mapping[str, float]] | None = None,
     ) -> None:
         """Prepare a scene; nothing is drawn yet.
 
         `seed` decides the person, the light and the room, `motion_seed` the motion; None for `seed`. A scene with the
-        `same_person` saves building the person. The scene consists of some `moments` of the recipe; None for all.
+        `same_person` saves building the person. The scene consists of some `moments` of the recipe; None for all. With
+        `faces`, it consists of these expressions, by coefficient, of the head at the first moment.
         """
         self.recipe, self.seed, self.motion_seed = recipe, seed, seed if motion_seed is None else motion_seed
         self._same_person = same_person
@@ -59,7 +61,9 @@ class SyntheticScene:
         coefficients = np.random.default_rng([seed, 0]).standard_normal(count).astype(np.float32)
         self.identity = torch.from_numpy(recipe.identity_scale * np.clip(coefficients, -2, 2)).float()
         self.moments = None if moments is None else tuple(moments)
+        self.faces = None if faces is None else tuple(dict(each) for each in faces)
         motion = generate_motion(self.model, self.identity, recipe, self.motion_seed)
+        motion = motion if self.faces is None else with_expressions(self.model, motion[0], self.faces)
         self.face = motion if moments is None else motion[list(moments)]
         self.drawn_model, self._drawn_face = self.model, self.face
         if recipe.off_model > 0:
@@ -72,7 +76,7 @@ class SyntheticScene:
     @property
     def timesteps(self) -> int:
         """The number of timesteps that the scene consists of."""
-        return self.recipe.timesteps if self.moments is None else len(self.moments)
+        return len(self.face)
 
     @property
     def camera(self) -> Camera:
@@ -161,15 +165,16 @@ class SyntheticScene:
                 "kind": "synthetic",
                 "seed": self.seed,
                 "motion_seed": self.motion_seed,
-                "recipe": asdict(self.recipe),
+                "recipe": self.recipe.record,
                 **self.extent,
             },
         )
 
     @property
     def extent(self) -> dict:
-        """The moments for keys and records. It is empty for whole recipes."""
-        return {} if self.moments is None else {"moments": list(self.moments)}
+        """The moments and faces for keys and records. It is empty for whole recipes."""
+        extent: dict = {} if self.moments is None else {"moments": list(self.moments)}
+        return extent if self.faces is None else {**extent, "faces": list(self.faces)}
 
     @property
     def source(self) -> dict:
@@ -177,7 +182,7 @@ class SyntheticScene:
         marks = self.model.landmarks["mediapipe"]  # they place paint and strands
         embedding = marks.faces.numpy().tobytes() + marks.barycentric.numpy().tobytes()
         content = {
-            "recipe": asdict(self.recipe),
+            "recipe": self.recipe.record,
             "seed": self.seed,
             "motion_seed": self.motion_seed,
             "face_model": self.model.content_hash,
@@ -203,7 +208,7 @@ def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
     for index, name in enumerate(recipe.camera_ids[1:], 1):
         share = (index - 1) / max(len(recipe.camera_ids) - 2, 1)
         around = 72.0 * (2 * share - 1), (0.0, 24.0, -16.0)[index % 3]
-        azimuth, elevation = map(math.radians, SIDES[name] if recipe.cameras == "sides" else around)
+        azimuth, elevation = map(math.radians, recipe.angles.get(name, around))
         away = torch.tensor([
             math.sin(azimuth) * math.cos(elevation),
             math.sin(elevation),

@@ -58,6 +58,8 @@ def paint_skin(
     _paint_stubble(canvas, anatomy, noise, stubble, hair_color)
     _paint_lips(canvas, anatomy, view, noise, tone)
     _paint_brows(canvas, anatomy, view, noise, hair_color)
+    if recipe.make_up > 0:
+        _paint_make_up(canvas, anatomy, view, recipe.make_up)
     if recipe.hair != "none":
         # Long hair is combed away from the hairline, where skin shows.
         lowered = np.array([0, 0.022 if recipe.hair == "long" else 0.0, 0], np.float32)
@@ -207,6 +209,32 @@ def _paint_brows(canvas: _Canvas, anatomy: Anatomy, view: FrontView, noise: Soli
         share = np.clip(mask * (0.62 + 0.4 * hairs), 0, 0.9)[:, None]
         canvas.albedo[:] = canvas.albedo * (1 - share) + hair_color * share
         canvas.gloss[:] *= 1 - 0.7 * mask
+
+
+_LIPSTICK = np.array([0.30, 0.018, 0.03], np.float32)
+_EYE_SHADOW = np.array([0.05, 0.03, 0.045], np.float32)
+_BROW_PENCIL = np.array([0.02, 0.013, 0.01], np.float32)
+
+
+def _paint_make_up(canvas: _Canvas, anatomy: Anatomy, view: FrontView, strength: float) -> None:
+    """Paint red lips, dark lids with a line along the lashes, and filled brows."""
+    marks, points = anatomy.landmarks, canvas.points
+    in_front = smoothstep(marks[places.EAR, 2], marks[places.EAR, 2] + 0.02, points[:, 2])
+
+    def paint(mask: np.ndarray, color: np.ndarray, share: float) -> None:
+        amount = (strength * share * mask * in_front)[:, None]
+        canvas.albedo[:] = canvas.albedo * (1 - amount) + color * amount
+
+    paint(view.look_up(view.polygon(marks[list(places.LIPS_OUTER)], 0.0009), points), _LIPSTICK, 0.85)
+    for side in SIDES:
+        lid = marks[list(places.UPPER_LIDS[side])]
+        brow = marks[list(places.BROWS_LOWER[side])]
+        crease = lid + 0.55 * (brow.mean(0) - lid.mean(0))
+        paint(view.look_up(view.polygon(np.concatenate([lid, crease[::-1]]), 0.003), points), _EYE_SHADOW, 0.6)
+        for lids in (places.UPPER_LIDS[side], places.LOWER_LIDS[side]):
+            paint(view.look_up(view.line(anatomy.curve(lids, 40), 0.0009, 0.0009), points), _EYE_SHADOW, 0.8)
+        outline = np.concatenate([marks[list(places.BROWS_UPPER[side])], brow[::-1]])
+        paint(view.look_up(view.polygon(outline, 0.001), points), _BROW_PENCIL, 0.9)
 
 
 def _paint_stubble(
