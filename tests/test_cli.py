@@ -78,6 +78,8 @@ def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
     ("create a.mp4 --uot here", ("Missing from mien create: --out DIR; Unrecognized options: --uot here",)),
     ("train here --training.step 3", ("Unrecognized options: --training.step",)),
     ("create a.mp4 --method headgas --step 3 --out here", ("Unrecognized options: --step, 3",)),
+    ("create a.mp4 --out b --tracking.paper.start 3", ("`mien track` has all options of tracking", "see mien create")),
+    ("batch-row --help", ("which `mien batch` starts",)),
     ("render here --out a.mp4 --siez 3", ("--siez", "Perhaps you meant: --size INT; see mien render --help",)),
     ("create", ("--out DIR", "see mien create --help")),
     ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),

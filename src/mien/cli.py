@@ -124,7 +124,9 @@ def _dispatch(arguments: list[str]) -> int:
         show(f"mien {mien.__version__}")
         return 0
     name, rest = arguments[0], arguments[1:]
-    if name == _ROW and rest:
+    if name == _ROW:
+        if len(rest) != 1 or rest[0].startswith("-"):
+            raise UserError(f"`mien {_ROW}` is the process of a row, which `mien batch` starts; start that")
         from mien.batch.row import do_steps, row_process
 
         return row_process(Path(rest[0]), sys.stdin, partial(do_steps, main))

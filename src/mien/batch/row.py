@@ -180,7 +180,10 @@ def tail(log: Path, since: int = 0) -> str:
 
 def row_process(root: Path, given: IO[str], do: Do) -> int:
     """Be the process of the row that is given as the first line of `given`, and stop when `given` ends."""
-    row = decode(Row, json.loads(given.readline()))
+    try:
+        row = decode(Row, json.loads(given.readline()))
+    except ValueError:
+        raise UserError("standard input holds no row; `mien batch` starts this process, and gives it one") from None
     threading.Thread(target=_stop_at_end, args=(given,), daemon=True).start()
     try:
         with orderly_stops():

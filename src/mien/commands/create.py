@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -50,6 +50,9 @@ class Command:
     avatar is trained on the videos given here.
     """
 
+    remedies: ClassVar[dict[str, str]] = {
+        "--tracking.": "`mien track` has all options of tracking", "--alignment.": "`mien align` has all of alignment",
+    }  # fmt: skip
     videos: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH [PATH ...]")]
     """Video files, or folders of pictures in order."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]

@@ -94,7 +94,7 @@ class Film(_Neutral, _Film, _Drive):
 class Show(_Neutral, _Drive):
     """Play the motion of somebody else in a viewer in the browser. --out FILE.mp4 writes a film, with more options."""
 
-    remedy: ClassVar[str] = "options of films need --out FILE.mp4; "
+    remedies: ClassVar[dict[str, str]] = {"--": "options of films need --out FILE.mp4"}
     port: Annotated[int, PORT] = 0
     """Port of the viewer. 0 means a free one."""
 
@@ -119,7 +119,7 @@ class Show(_Neutral, _Drive):
 class Follow(_Film, _Drive):
     """Make an avatar follow a camera, in a viewer in the browser."""
 
-    remedy: ClassVar[str] = "options of recordings and videos are not for a camera; "
+    remedies: ClassVar[dict[str, str]] = {"--": "options of recordings and videos are not for a camera"}
     out: Path | None = None
     """An .mp4 that records it."""
     camera_format: CameraFormat | None = None

@@ -71,8 +71,10 @@ def parse_options(kind: type, prog: str, arguments: Sequence[str]) -> Any:
         with contextlib.redirect_stderr(told):
             found = tyro.cli(kind, prog=prog, args=arguments, default=default, config=_STYLE, return_unknown_args=more)
     except SystemExit:
-        remedy = getattr(kind, "remedy", "")
-        raise UserError(f"{in_one_line(told.getvalue())}; {remedy}see {prog} --help-all") from None
+        complaint, remedies = in_one_line(told.getvalue()), getattr(kind, "remedies", {})
+        unknown = names if "Unrecognized" in complaint else []
+        remedy = "".join({f"{each}; " for start, each in remedies.items() if any(n.startswith(start) for n in unknown)})
+        raise UserError(f"{complaint}; {remedy}see {prog} --help-all") from None
     command = replace(found[0], for_all=tuple(found[1])) if more else found
     for name, option, _, marks in _named_fields(type(command), ""):  # groups of settings check themselves
         for allowed in (mark for mark in marks if isinstance(mark, Range)):

@@ -117,10 +117,10 @@ class Tally:
         from mien.disk.files import check_writable
         from mien.lab.analysis.study.files import read_all_answers, read_key
 
-        if not self.answers:
-            raise UserError("no answers to tally; give the files that participants saved, or a folder of them")
         if not self.key.is_file():
             raise UserError(f"{self.key}: no such file; give the key that `mien study make` wrote beside the page")
+        if not self.answers:
+            raise UserError("no answers to tally; give the files that participants saved, or a folder of them")
         if self.out is not None:
             check_writable(self.out)
         read_all_answers(self.answers, read_key(self.key))
