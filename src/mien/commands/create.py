@@ -159,7 +159,7 @@ class Command:
         from mien.pipeline.face_models import face_model_of
         from mien.pipeline.names import doubled_videos
         from mien.pipeline.track import check_masks
-        from mien.training.run import check_run, check_untouched, check_videos
+        from mien.training.run import check_run, check_untouched, check_videos, is_part_of
 
         run_dir, settings = workspace.run_dir(run), self.options.settings()
         check_run(run_dir, self.options.method_config(), settings)
@@ -172,5 +172,8 @@ class Command:
         if self.calibration is None:
             names = sequence_names(self.videos, self.name)
             check_videos(run_dir, names, workspace.sequence_names())
+            for held in settings.held_out_sequences:
+                if not any(is_part_of(held, name) for name in names):
+                    raise UserError(f"--hold-out {held}: no such sequence; there will be: {', '.join(names)}")
             for warning in doubled_videos(self.videos, names, settings.held_out_sequences):
                 say(f"warning: {warning}")

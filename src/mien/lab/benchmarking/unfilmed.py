@@ -63,7 +63,7 @@ class PosedPictures:
 
     def target(self, timestep: int, camera: int) -> Float[Tensor, "h w 3"]:
         """A true picture."""
-        return torch.from_numpy(np.asarray(self.images[timestep, camera])).float() / 255
+        return torch.from_numpy(np.array(self.images[timestep, camera])).float() / 255
 
 
 def score_unfilmed(
