@@ -83,7 +83,7 @@ MEMBERS = {
     "long": (header("<f8", (4, 3)) + bytes(104), "is not as long as its header states"),
     "other version": (header("<f8", (4, 3), (3, 0)), "version"),
     "a long header": (header("<f8", (1,) * 9000), "cannot be read as .npz"),
-    "no dimension": (NUMBER, r"'v_template' has the shape \[\] of float64, not numbers"),
+    "no dimension": (NUMBER, r"'v_template' has the shape \[\] of float64, not \[v, 3\] of numbers"),
 }
 WHOLE = {
     "more members than there are": (ONE[:-10] + struct.pack("<I", 2 * MIB) + ONE[-6:], "far more members than such a"),

@@ -60,12 +60,17 @@ _SCORED, _PRESET = EvaluationSettings(perceptual_frames=8, video_frames=0), PRES
 
 
 def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
-    """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png."""
+    """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png.
+
+    References of unfilmed faces have tables and files of their own, in the workspaces of their runs.
+    """
     usual = [name for name, reference in REFERENCES.items() if reference.by_default]
     references, rows, strips = [reference_named(name) for name in captures or usual], [], []
     with hold(out / "quality", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
         for reference in [one for one in references if one.unfilmed]:
-            show(run_unfilmed(reference, out, method, steps or reference.steps))
+            table = run_unfilmed(reference, out, method, steps or reference.steps)
+            if not as_json:
+                show(table)
         for reference in [one for one in references if not one.unfilmed]:
             row, strip = _run_reference(reference, out, method, steps or reference.steps)
             rows.append(row)
@@ -74,8 +79,10 @@ def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: 
             write_json(out / "quality.json", _FORMAT, _VERSION, json.loads(json.dumps(content)))
             write_atomically(out / "quality.md", lambda path: path.write_text(markdown_table(rows), "utf-8"))
             write_png(out / "contact_sheet.png", np.concatenate(strips))
-    show(json.dumps([asdict(row) for row in rows]) if as_json else markdown_table(rows))
-    say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
+    if rows or as_json:
+        show(json.dumps([asdict(row) for row in rows]) if as_json else markdown_table(rows))
+    if rows:
+        say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
 def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
@@ -163,6 +170,7 @@ def run_unfilmed(reference: ReferenceCapture, out: Path, method: str, steps: int
         figures[run], sheet = score_unfilmed(load_avatar(folder), pictures, ScoreSettings(perceptual_frames=0))
         write_png(folder / "unfilmed.png", sheet)
         write_json(folder / "unfilmed.json", "mien.unfilmed", 1, {"key": key, "regions": figures[run]})
+    say(f"Look at unfilmed.png in {', '.join(str(true.run_dir(run)) for run in figures)}")
     return unfilmed_table(reference.name, key, figures)
 
 
