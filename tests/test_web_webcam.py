@@ -194,8 +194,9 @@ CLASS = """
   if (told.textContent.includes("fetched")) return [told.textContent];
   const jaw = avatar.viewer.avatar.expression_names.indexOf("jawOpen"), { expression } = avatar.viewer.face;
   const jaws = [];
-  for (const frame of [rest, open, rest]) {
-    for (let k = 0; k < 8; ++k) await film(frame);
+  const shut = () => expression[jaw] < 0.1, wide = () => expression[jaw] > 0.25;
+  for (const [frame, arrived] of [[rest, shut], [open, wide], [rest, shut]]) {  // a busy machine drops frames
+    for (let k = 0; k < 8 || (k < 400 && !arrived()); ++k) await film(frame);
     jaws.push(expression[jaw]);
   }
   return [told.textContent, jaws];
