@@ -1,4 +1,4 @@
-"""Which triangles of a face model are hair, skin, neck, eyes and the inside of the mouth, and colours of the latter.
+"""Triangles of a face model that are hair, skin, neck, eyes and the inside of the mouth, and colours of the latter.
 
 Also, where eyes and mouth of a posed face model are in a picture.
 """

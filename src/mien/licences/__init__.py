@@ -26,7 +26,7 @@ _MEANINGS = {
     "proprietary": "its maker's own terms; free to use, and not to be changed",
     "unknown": "read its licence before you use it",
 }
-"""What each kind asks for, from the fewest conditions to the most."""
+"""Conditions of each kind, from the fewest conditions to the most."""
 _ORDER = list(_MEANINGS)
 
 
@@ -53,12 +53,12 @@ class Licence:
     name: str
     version: str
     declared: str
-    """What its metadata says, word for word: the SPDX expression, else the classifiers, else the field `License`."""
+    """Licence in its metadata, word for word: the SPDX expression, else the classifiers, else the field `License`."""
     licence: str
     """SPDX expression, or what is declared if there is none for it."""
     kind: str
     used_for: str
-    """What brings it: an extra of mien, and the package that asks for it. "another program" if mien does not."""
+    """Source of the package: an extra of mien, and the package that asks for it. "another program" if mien does not."""
     meaning: str
 
 

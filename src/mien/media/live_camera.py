@@ -33,7 +33,7 @@ _STREAM = {"flags": "low_delay", "timeout": "5000000"}
 _RETRY_SECONDS, _PATIENCE_SECONDS = 1.0, 2.0
 _Frames = Iterator[tuple[float, Callable[[], np.ndarray]]]
 _Opened = tuple[contextlib.ExitStack, _Frames]
-"""What closes a source, and what makes its pictures, each with the time in seconds at which a file shows it."""
+"""A stack that closes a source, and its frames: the time in seconds at which a file shows one, and what makes it."""
 
 
 @dataclass(frozen=True, eq=False)

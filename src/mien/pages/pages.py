@@ -123,7 +123,7 @@ def _finite(series: Sequence[Series]) -> list[Series]:
 
 
 def _content(series: Sequence[Series], axes: Axes) -> dict[str, Any]:
-    """What the templates draw of series that each have a finite value."""
+    """Charts that the templates draw of series that each have a finite value."""
     if axes.logarithmic:
         series = [replace(one, x=np.log10(one.x), y=np.log10(one.y)) for one in series]
     x_range = _range(np.concatenate([one.x for one in series]))

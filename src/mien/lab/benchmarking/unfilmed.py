@@ -32,6 +32,7 @@ from mien.render.mesh import rasterize_mesh
 
 REGIONS = ("glasses", "teeth", "mouth", "lids", "brows", "cheeks", "rest")
 """The regions of a face. A pixel belongs to the first that it is in."""
+# The face's outline as a contour. `mien.tracking.landmarks.groups.OVAL` has the same points without an order.
 _OVAL = (10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377,
          152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109)  # fmt: skip
 _CHEEKS = ((117, 118, 119, 120, 100, 142, 36, 205, 187, 123), (346, 347, 348, 349, 329, 371, 266, 425, 411, 352))
@@ -59,7 +60,7 @@ class PosedPictures:
     images: UInt8[np.ndarray, "t c h w 3"]
     truth: Truth
     glasses: tuple[Bool[np.ndarray, "h w"] | None, ...]
-    """Where each camera sees the frame of the glasses, which do not move. None if there are none."""
+    """Masks of the glasses' frame as each camera sees it. Glasses do not move. None if there are none."""
 
     def target(self, timestep: int, camera: int) -> Float[Tensor, "h w 3"]:
         """A true picture."""
@@ -132,7 +133,7 @@ def _figures(rows: Sequence[tuple[str, bool, float, float, float | None]]) -> Fi
 
 
 def glasses_masks(scene: SyntheticScene) -> tuple[Bool[np.ndarray, "h w"] | None, ...]:
-    """Where each camera sees the frame of the glasses of a scene whose head does not move. None without glasses."""
+    """Masks of the glasses' frame as each camera sees it, in a scene whose head does not move. None without glasses."""
     glasses = scene.subject.glasses
     if glasses is None:
         return (None,) * len(scene.cameras)
@@ -177,7 +178,7 @@ def _distance(metric: Any, image: Tensor, target: Tensor, mask: Bool[np.ndarray,
 
 
 def _masks(pictures: PosedPictures, timestep: int, camera: int) -> Mapping[str, Bool[np.ndarray, "h w"]]:
-    """Where the regions are, at the face or at rest, since what is left behind counts as well."""
+    """Masks of the regions, at the face and at rest together, since what is left behind counts as well."""
     size = pictures.images.shape[2:4]
     marks = [pictures.truth.landmarks[moment, camera] for moment in (0, timestep)]
     eye = float(np.linalg.norm(marks[0][33] - marks[0][133]))
