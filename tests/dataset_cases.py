@@ -168,7 +168,7 @@ class Campaign:
         by_command = dice.randrange(_BY_COMMAND) == 0 and self.layout != COEFFICIENTS and not retrack
         before = tree_bytes(canary)  # some faults move the file there
         around = {each.name for each in self.folder.iterdir()}
-        complaint, wrong, start = "", "", time.perf_counter()
+        complaint, wrong, start = "", "", time.process_time()
         try:
             if by_command:
                 options = [] if self.layout == "gaussian-avatars" else ["--face-model", name]
@@ -179,7 +179,7 @@ class Campaign:
             complaint = str(error).partition(" (Type-check error")[0]  # tests check types at run time, users do not
         except Exception as error:
             wrong = f"{type(error).__name__}: {error}"
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         if not wrong:
             wrong = self.fault_of(complaint, out, {*around, out.name}, seconds)
         if tree_bytes(canary) != before:
@@ -193,7 +193,7 @@ class Campaign:
         if "\n" in complaint or len(complaint) > _LONGEST_LINE:
             return f"a complaint of several lines, or a long one: {complaint[:3000]!r}"
         if seconds > _MOST_SECONDS:
-            return f"took {seconds:.0f} s"
+            return f"took {seconds:.0f} s of the processor"
         more = {each.name for each in self.folder.iterdir()} - around
         if more:
             return f"wrote beside the output: {sorted(more)}"
