@@ -4,11 +4,13 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 
 #include <algorithm>
 #include <cstdint>
 #include <iterator>
 #include <limits>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <type_traits>
@@ -103,6 +105,18 @@ void check_indices(const A& indices, int64_t count, const char* message, int64_t
     bits |= (index - static_cast<uint64_t>(least)) | (static_cast<uint64_t>(count) - 1 - index);
   }
   if (bits >> 63) throw std::out_of_range(message);
+}
+
+// For each Gaussian, a row of a table.
+using Rows = Array<const int64_t, nb::ndim<1>>;
+
+// The rows of `count` Gaussians in a table of so many; null stands for the first row.
+inline const int64_t* checked_rows(const std::optional<Rows>& rows, size_t count, size_t of) {
+  require(of >= 1, "a table must have a row");
+  if (!rows) return nullptr;
+  require(rows->shape(0) == count, "there must be a row for each Gaussian");
+  check_indices(*rows, static_cast<int64_t>(of), "a Gaussian names a row that does not exist");
+  return rows->data();
 }
 
 // Arguments that belong together, as Python passes them: a tuple, usually the named one that `bind_group` makes. `T`

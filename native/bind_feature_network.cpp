@@ -52,22 +52,18 @@ struct NetworkArrays {
 
 struct BasesArrays {
   static constexpr char kName[] = "FeatureBases";
-  static constexpr const char* kFields[] = {"values", "inputs", "by_input"};
+  static constexpr const char* kFields[] = {"values", "inputs", "rows"};
   In<-1, -1, -1> values;
-  In<-1> inputs;
-  bool by_input = false;
+  In<-1, -1> inputs;
+  std::optional<Rows> rows;
 
-  explicit BasesArrays(const Group<BasesArrays>& group) { group.read(values, inputs, by_input); }
+  explicit BasesArrays(const Group<BasesArrays>& group) { group.read(values, inputs, rows); }
 
-  void append(size_t count, size_t features, std::vector<mien::FeatureInput>& items) const {
-    const size_t k = inputs.shape(0);
-    require(by_input ? has_shape(values, k, count, features) : has_shape(values, count, k, features),
+  mien::FeatureInputs of(const NetworkArrays& own) const {
+    const int k = checked_length(inputs.shape(1), kMostWidth, "inputs");
+    require(has_shape(values, own.count(), k, own.features()),
             "bases must have one row per Gaussian and input, as long as its features");
-    checked_length(k, kMostWidth, "inputs");
-    const size_t between = by_input ? count * features : features, stride = by_input ? features : k * features;
-    for (size_t i = 0; i < k; ++i) {
-      items.push_back({values.data() + i * between, static_cast<int64_t>(stride), inputs.data()[i]});
-    }
+    return {values.data(), k, inputs.data(), checked_rows(rows, own.count(), inputs.shape(0))};
   }
 };
 
@@ -96,65 +92,56 @@ struct GradientArrays {
   Out<-1> bias2, inputs;
   Out<-1, -1> owns;
 
-  GradientArrays(const Group<GradientArrays>& group, const NetworkArrays& own, size_t inputs_count) {
+  GradientArrays(const Group<GradientArrays>& group, const NetworkArrays& own, const mien::FeatureInputs& in) {
     group.read(outputs, last, features, weight1, bias1, weight2, bias2, inputs, owns);
     require(has_shape(outputs, own.count(), own.bias2.shape(0) - 1) && has_shape(last, own.count()),
             "outputs must have one row per Gaussian");
     require(same_shape(features, own.neutral) && same_shape(weight1, own.weight1) && same_shape(bias1, own.bias1) &&
                 same_shape(weight2, own.weight2) && same_shape(bias2, own.bias2) &&
-                (inputs.shape(0) == 0 || has_shape(inputs, inputs_count)) &&
+                (inputs.shape(0) == 0 || (has_shape(inputs, in.count) && !in.rows)) &&
                 (owns.shape(0) == 0 || same_shape(owns, own.own)),
             "a gradient must have the shape of its array");
   }
 };
 
-using Bases = std::vector<Group<BasesArrays>>;
-
-// All inputs, whose arrays stay alive while `arrays` does.
-std::vector<mien::FeatureInput> inputs_of(const std::vector<BasesArrays>& arrays, const NetworkArrays& own) {
-  std::vector<mien::FeatureInput> items;
-  for (const BasesArrays& one : arrays) one.append(own.count(), own.features(), items);
-  return items;
-}
-
-void feature_network(const Group<NetworkArrays>& group, const Bases& bases,
+void feature_network(const Group<NetworkArrays>& group, const Group<BasesArrays>& bases,
                      const std::optional<Group<KeptArrays>>& keep, const Out<-1, -1>& outputs, const Out<-1>& last) {
   const NetworkArrays own(group);
-  const std::vector<BasesArrays> arrays(bases.begin(), bases.end());
-  const std::vector<mien::FeatureInput> items = inputs_of(arrays, own);
+  const BasesArrays arrays(bases);
+  const mien::FeatureInputs inputs = arrays.of(own);
   const mien::FeatureNetwork network = own.network();
   require(has_shape(outputs, own.count(), network.width - 1) && has_shape(last, own.count()),
           "outputs must have one row per Gaussian");
   std::optional<KeptArrays> kept;
   if (keep) kept.emplace(*keep, network);
   const nb::gil_scoped_release release;
-  mien::feature_network(network, {items.data(), static_cast<int64_t>(items.size())},
+  mien::feature_network(network, inputs,
                         kept ? mien::FeatureKept{kept->features.data(), kept->hidden.data()} : mien::FeatureKept{},
                         outputs.data(), last.data());
 }
 
-void feature_network_backward(const Group<NetworkArrays>& group, const Bases& bases, const Group<KeptArrays>& keep,
-                              const Group<GradientArrays>& gradients) {
+void feature_network_backward(const Group<NetworkArrays>& group, const Group<BasesArrays>& bases,
+                              const Group<KeptArrays>& keep, const Group<GradientArrays>& gradients) {
   const NetworkArrays own(group);
-  const std::vector<BasesArrays> arrays(bases.begin(), bases.end());
-  const std::vector<mien::FeatureInput> items = inputs_of(arrays, own);
+  const BasesArrays arrays(bases);
+  const mien::FeatureInputs inputs = arrays.of(own);
   const mien::FeatureNetwork network = own.network();
   const KeptArrays kept(keep, network);
-  const GradientArrays out(gradients, own, items.size());
+  const GradientArrays out(gradients, own, inputs);
   const nb::gil_scoped_release release;
   mien::feature_network_backward(
-      network, {items.data(), static_cast<int64_t>(items.size())}, {kept.features.data(), kept.hidden.data()},
+      network, inputs, {kept.features.data(), kept.hidden.data()},
       {out.outputs.data(), out.last.data(), out.features.data(), out.weight1.data(), out.bias1.data(),
        out.weight2.data(), out.bias2.data(), out.inputs.shape(0) == 0 ? nullptr : out.inputs.data(),
        out.owns.shape(0) == 0 ? nullptr : out.owns.data()});
 }
 
 void factored_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
-                     const std::vector<In<-1>>& columns, const Out<-1, -1>& second, const Out<-1>& weights,
-                     float rate) {
+                     const std::vector<In<-1, -1>>& columns, const std::vector<std::optional<Rows>>& places,
+                     const Out<-1, -1>& second, const Out<-1>& weights, float rate) {
   const size_t count = values.shape(0), width = values.shape(2);
   require(has_shape(second, count, width) && has_shape(weights, count), "moments must fit the values");
-  const FactoredTerms gradient(values, rows, columns);
+  const FactoredTerms gradient(values, rows, columns, places);
   const nb::gil_scoped_release release;
   mien::factored_update({values.data(), static_cast<int64_t>(count), gradient.columns_count, gradient.width,
                          gradient.terms.data(), static_cast<int>(gradient.terms.size()), second.data(), weights.data(),
@@ -172,7 +159,7 @@ void bind_feature_network(nb::module_& module) {
              "last"_a.noconvert(), "Fills the network's outputs, the last of each Gaussian apart.");
   module.def("feature_network_backward", &feature_network_backward, "network"_a, "bases"_a, "kept"_a, "gradients"_a,
              "Fills the gradients of features, layers and inputs.");
-  module.def("factored_update", &factored_update, "values"_a.noconvert(), "rows"_a, "columns"_a, "second"_a,
+  module.def("factored_update", &factored_update, "values"_a.noconvert(), "rows"_a, "columns"_a, "places"_a, "second"_a,
              "weights"_a, "rate"_a,
              "Updates values [n, k, f] by a gradient that is a sum of outer products, in place.");
 }

@@ -60,10 +60,11 @@ struct AdamArrays {
 };
 
 void factored_adam_update(const Out<-1, -1, -1>& values, const std::vector<In<-1, -1>>& rows,
-                          const std::vector<In<-1>>& columns, const Out<-1, -1, -1>& first,
-                          const Out<-1, -1, -1>& second, const Array<float, nb::shape<>>& steps, double rate) {
+                          const std::vector<In<-1, -1>>& columns, const std::vector<std::optional<Rows>>& places,
+                          const Out<-1, -1, -1>& first, const Out<-1, -1, -1>& second,
+                          const Array<float, nb::shape<>>& steps, double rate) {
   require(same_shape(first, values) && same_shape(second, values), "moments must have the shape of the values");
-  const FactoredTerms gradient(values, rows, columns);
+  const FactoredTerms gradient(values, rows, columns, places);
   const Corrections found = next_corrections(steps, rate);
   const nb::gil_scoped_release release;
   mien::factored_adam_update({values.data(), gradient.terms.data(), first.data(), second.data(),
@@ -162,7 +163,7 @@ void absolute_difference(const Array<const float, nb::ndim<2>>& values, const Ar
 
 void bind_training(nb::module_& module) {
   bind_group<AdamArrays>(module);
-  module.def("factored_adam_update", &factored_adam_update, "values"_a.noconvert(), "rows"_a, "columns"_a,
+  module.def("factored_adam_update", &factored_adam_update, "values"_a.noconvert(), "rows"_a, "columns"_a, "places"_a,
              "first"_a.noconvert(), "second"_a.noconvert(), "steps"_a.noconvert(), "rate"_a,
              "Makes one step of Adam with values [n, k, f], whose gradient is a sum of outer products.");
   module.def("adam_update", &adam_update, "tasks"_a,

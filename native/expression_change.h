@@ -6,29 +6,38 @@
 
 namespace mien {
 
-constexpr int kMostExpressionRank = 8;
-
-// The activations of one face: (inputs - rest) directions, softly shortened to how far training saw faces go that way.
+// Activations of one face: (inputs - rest) directions, each block of them softly shortened to how far training saw
+// faces go that way.
 struct ActivationArrays {
   const float* inputs;  // [inputs_count]
   int64_t inputs_count;
   const float* rest;        // [inputs_count]
   const float* directions;  // [inputs_count, rank]
-  int64_t rank;
-  const float* seen;  // [seen_count, rank]: activations that training saw; none shortens nothing
+  int64_t rank, block;      // block: the number of activations that are shortened together; it divides rank
+  const float* seen;        // [seen_count, rank]: activations that training saw; none shortens nothing
   int64_t seen_count;
 };
 // Fills out [rank]. Sums run in the order of the inputs, so that training and the runtime get the same bits.
 void expression_activations(const ActivationArrays& arrays, float* out);
-// Fills the gradient of the inputs, given that of the activations [rank].
-void expression_activations_backward(const ActivationArrays& arrays, const float* gradient, float* grad_inputs);
 
-// out [count] = basis [count, rank] activations [rank], with a rank of 1 to 8. Runs on the pool.
-void expression_change(const float* basis, const float* activations, int rank, int64_t count, float* out);
+// How the head moved: the sines of its turns about its own axes at rest, and its shift along them, in metres. Poses are
+// an axis-angle vector, then the place.
+void head_motion(const float* rest, const float* pose, float* out);
 
-// Fills the gradients of the basis and of the activations. The result does not depend on the number of threads. Runs on
-// the pool.
-void expression_change_backward(const float* basis, const float* activations, const float* gradient, int rank,
-                                int64_t count, float* grad_basis, float* grad_activations);
+// out [rows, width] = shares [rows, regions] table [regions, width], in the order of the regions.
+void blend_regions(const float* shares, const float* table, int64_t rows, int64_t regions, int64_t width, float* out);
+
+// Bases [count, values, rank] of Gaussians, each with a row of activations [.., rank]: that of `rows` [count], or the
+// first if it is null.
+struct ExpressionBases {
+  int64_t count, values, rank;
+  const float* activations;
+  const int64_t* rows;
+};
+// Fills out [count, values], the sums of the bases' columns weighted by the activations. Runs on the pool.
+void expression_change(const ExpressionBases& bases, const float* basis, float* out);
+
+// Fills the gradient of the bases. Runs on the pool.
+void expression_change_backward(const ExpressionBases& bases, const float* gradient, float* grad_basis);
 
 }  // namespace mien

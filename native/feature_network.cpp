@@ -1,7 +1,6 @@
 #include "feature_network.h"
 
 #include <algorithm>
-#include <iterator>
 #include <vector>
 
 #include "feature_network_kernels.h"
@@ -16,7 +15,6 @@ namespace {
 
 constexpr int64_t kPiece = 16 * kFeatureBlock;  // Gaussians in one piece of the pool's work
 constexpr int kLanes = 16;                      // of the widest vector
-constexpr float kRest = 0.001f;                 // 1 - beta2 of Adam
 
 int64_t padded(int64_t width) { return (width + kLanes - 1) / kLanes * kLanes; }
 
@@ -64,10 +62,11 @@ float* scratch_of(const PaddedNetwork& network) {
   return scratch.data();
 }
 
-std::vector<FeatureInput> nonzero(const FeatureInputs& inputs) {
-  std::vector<FeatureInput> used;
-  std::copy_if(inputs.items, inputs.items + inputs.count, std::back_inserter(used),
-               [](const FeatureInput& input) { return input.value != 0; });
+// The inputs that are not 0 for all Gaussians.
+std::vector<int64_t> used_inputs(const FeatureInputs& inputs) {
+  std::vector<int64_t> used;
+  for (int64_t k = 0; k < inputs.count; ++k)
+    if (inputs.rows || inputs.values[k] != 0) used.push_back(k);
   return used;
 }
 
@@ -112,10 +111,10 @@ int64_t hidden_stride(int hidden) { return padded(hidden); }
 void feature_network(const FeatureNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                      float* outputs, float* last) {
   const PaddedNetwork own = pad(network, false);
-  const std::vector<FeatureInput> used = nonzero(inputs);
+  const std::vector<int64_t> used = used_inputs(inputs);
   const FeatureKernels& kernels = feature_kernels();
   parallel_for((network.count + kPiece - 1) / kPiece, [&](int64_t piece) {
-    kernels.forward(own, {used.data(), static_cast<int64_t>(used.size())}, kept, outputs, last, scratch_of(own),
+    kernels.forward(own, inputs, {used.data(), static_cast<int64_t>(used.size())}, kept, outputs, last, scratch_of(own),
                     piece * kPiece, std::min((piece + 1) * kPiece, network.count));
   });
 }
@@ -145,24 +144,13 @@ void feature_network_backward(const FeatureNetwork& network, const FeatureInputs
 }
 
 void factored_update(const FactoredUpdate& task) {
-  const int terms = task.terms_count;
-  std::vector<float> products(static_cast<size_t>(terms) * terms);
-  float most = 0;
-  for (int s = 0; s < terms; ++s) {
-    for (int t = 0; t < terms; ++t) {
-      float product = 0;
-      for (int k = 0; k < task.columns_count; ++k) product += task.terms[s].columns[k] * task.terms[t].columns[k];
-      const float mean = product / static_cast<float>(std::max(task.columns_count, 1));
-      most = std::max(most, mean);
-      products[s * terms + t] = kRest * mean;
-    }
-  }
-  if (!(most > 0)) return;
+  const auto terms = static_cast<size_t>(task.terms_count);
   const FeatureKernels& kernels = feature_kernels();
   parallel_for((task.count + kPiece - 1) / kPiece, [&](int64_t piece) {
-    thread_local std::vector<float> steps;
-    steps.resize(static_cast<size_t>(terms) * task.width);
-    kernels.update(task, products.data(), steps.data(), piece * kPiece, std::min((piece + 1) * kPiece, task.count));
+    thread_local std::vector<float> scratch;
+    scratch.resize(terms * (terms + task.width));
+    kernels.update(task, scratch.data(), scratch.data() + terms * terms, piece * kPiece,
+                   std::min((piece + 1) * kPiece, task.count));
   });
 }
 

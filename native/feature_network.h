@@ -7,15 +7,15 @@
 
 namespace mien {
 
-// One input of the face, and its share of every Gaussian's features: row i is at `column` + i * stride.
-struct FeatureInput {
-  const float* column;
-  int64_t stride;
-  float value;
-};
+// The bases of n Gaussians, and the inputs of the face that weight them: those of the first row of `values`, or with
+// `rows` [n] those of each Gaussian's own row.
 struct FeatureInputs {
-  const FeatureInput* items;
-  int64_t count;
+  const float* bases;   // [n, k, f]
+  int64_t count;        // k
+  const float* values;  // [.., k]
+  const int64_t* rows = nullptr;
+
+  const float* values_of(int64_t index) const { return values + (rows ? rows[index] * count : 0); }
 };
 
 struct FeatureNetwork {
@@ -34,7 +34,8 @@ struct FeatureKept {
   float* features;  // [n, f]
   float* hidden;    // [n, hidden_stride]
 };
-// Fills all outputs but the last [n, o - 1], and the last [n]. Inputs that are 0 are not read. Runs on the pool.
+// Fills all outputs but the last [n, o - 1], and the last [n]. Inputs that are 0 for all are not read. Runs on the
+// pool.
 void feature_network(const FeatureNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                      float* outputs, float* last);
 
@@ -43,7 +44,7 @@ struct FeatureGradients {
   const float* last;     // [n]
   float* features;       // [n, f], written: also the gradient of `neutral`
   float *weight1, *bias1, *weight2, *bias2;
-  float* inputs;  // one per input, or null
+  float* inputs;  // one per input, or null, as it must be with rows
   float* owns;    // [n, x], or null
 };
 // Gaussians whose outputs have no gradient are not read. The gradient of the bases is never made: that of input k's
@@ -52,10 +53,13 @@ void feature_network_backward(const FeatureNetwork& network, const FeatureInputs
                               const FeatureGradients& gradients);
 
 // Adam without a first moment and with one second moment per row of factors, for values [n, k, f] whose gradient is a
-// sum of outer products. Each term has `rows` [n, f] and `columns` [k].
+// sum of outer products. Each term has `rows` [n, f] and `columns` [k], or with `places` [n] a table of them [.., k].
 struct FactoredTerm {
   const float* rows;
   const float* columns;
+  const int64_t* places = nullptr;
+
+  const float* columns_of(int64_t index, int count) const { return columns + (places ? places[index] * count : 0); }
 };
 struct FactoredUpdate {
   float* values;
@@ -67,9 +71,8 @@ struct FactoredUpdate {
   float* weights;  // [n], running mean of 1, for bias correction: how much of `second` is filled
   float rate;
 };
-// Gaussians whose rows of factors are all 0 keep their values and moments. Columns that are 0 in all terms are neither
-// read nor written.
-// Runs on the pool.
+// Gaussians whose rows of factors or columns are all 0 keep their values and moments. Columns that are 0 in all terms
+// are neither read nor written. Runs on the pool.
 void factored_update(const FactoredUpdate& task);
 
 }  // namespace mien

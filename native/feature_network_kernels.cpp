@@ -15,54 +15,30 @@ MIEN_INLINE void add_scaled(const float* from, float factor, int width, float* t
   for (; i < width; ++i) to[i] += factor * from[i];
 }
 
-MIEN_INLINE const float* row_of(const FeatureInput& input, int64_t index) {
-  return input.column + index * input.stride;
-}
-
 // As `add_scaled` for all inputs of one Gaussian, with the sums in registers.
 template <int V>
-MIEN_INLINE void blend_vectors(const FeatureInputs& inputs, int64_t index, int place, float* to) {
+MIEN_INLINE void blend_vectors(const float* rows, const float* values, const UsedInputs& used, int width, float* to) {
   F sums[V];
   for (int v = 0; v < V; ++v) sums[v] = load(to + v * W);
-  for (int64_t k = 0; k < inputs.count; ++k) {
-    const float* row = row_of(inputs.items[k], index) + place;
-    for (int v = 0; v < V; ++v) sums[v] = sums[v] + inputs.items[k].value * load(row + v * W);
+  for (int64_t u = 0; u < used.count; ++u) {
+    const int64_t k = used.items[u];
+    for (int v = 0; v < V; ++v) sums[v] = sums[v] + values[k] * load(rows + k * width + v * W);
   }
   for (int v = 0; v < V; ++v) store(to + v * W, sums[v]);
 }
 
-void blend_one(const FeatureInputs& inputs, int64_t index, int width, float* to) {
-  int i = 0;
-  for (; i + 2 * W <= width; i += 2 * W) blend_vectors<2>(inputs, index, i, to + i);
-  for (; i + W <= width; i += W) blend_vectors<1>(inputs, index, i, to + i);
-  for (; i < width; ++i)
-    for (int64_t k = 0; k < inputs.count; ++k) to[i] += inputs.items[k].value * row_of(inputs.items[k], index)[i];
-}
-
-// Whether every input's Gaussians lie together, row after row.
-bool all_by_input(const FeatureInputs& inputs, int64_t width) {
-  for (int64_t k = 0; k < inputs.count; ++k)
-    if (inputs.items[k].stride != width) return false;
-  return true;
-}
-
 // The blended features of a block go into the first columns of `rows`.
-void blend(const PaddedNetwork& network, const FeatureInputs& inputs, int64_t first, int64_t count, float* rows) {
+void blend(const PaddedNetwork& network, const FeatureInputs& inputs, const UsedInputs& used, int64_t first,
+           int64_t count, float* rows) {
   const int width = network.own->features;
-  for (int64_t i = 0; i < count; ++i) {
-    copy(rows + i * network.in_stride, network.own->neutral + (first + i) * width, width);
-  }
-  // Memory is read in its order: a Gaussian's inputs may lie together, or an input's Gaussians.
-  if (all_by_input(inputs, width)) {
-    for (int64_t k = 0; k < inputs.count; ++k) {
-      for (int64_t i = 0; i < count; ++i) {
-        add_scaled(row_of(inputs.items[k], first + i), inputs.items[k].value, width, rows + i * network.in_stride);
-      }
-    }
-  } else {
-    for (int64_t i = 0; i < count; ++i) {
-      blend_one(inputs, first + i, width, rows + i * network.in_stride);
-    }
+  for (int64_t index = first; index < first + count; ++index, rows += network.in_stride) {
+    const float *own = inputs.bases + index * inputs.count * width, *values = inputs.values_of(index);
+    copy(rows, network.own->neutral + index * width, width);
+    int i = 0;
+    for (; i + 2 * W <= width; i += 2 * W) blend_vectors<2>(own + i, values, used, width, rows + i);
+    for (; i + W <= width; i += W) blend_vectors<1>(own + i, values, used, width, rows + i);
+    for (; i < width; ++i)
+      for (int64_t u = 0; u < used.count; ++u) rows[i] += values[used.items[u]] * own[used.items[u] * width + i];
   }
 }
 
@@ -73,8 +49,8 @@ MIEN_INLINE void fill_own(const PaddedNetwork& network, int64_t index, float* ro
   for (int64_t c = features + own; c < network.in_stride; ++c) row[c] = 0;
 }
 
-void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept, float* outputs,
-             float* last, float* scratch, int64_t first, int64_t end) {
+void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const UsedInputs& used, const FeatureKept& kept,
+             float* outputs, float* last, float* scratch, int64_t first, int64_t end) {
   [[maybe_unused]] const NoDenormals guard;
   const FeatureNetwork& own = *network.own;
   float* const rows = scratch;
@@ -82,7 +58,7 @@ void forward(const PaddedNetwork& network, const FeatureInputs& inputs, const Fe
   float* const out = values + kFeatureBlock * network.hidden_stride;
   for (int64_t begin = first; begin < end; begin += kFeatureBlock) {
     const int64_t count = end - begin < kFeatureBlock ? end - begin : kFeatureBlock;
-    blend(network, inputs, begin, count, rows);
+    blend(network, inputs, used, begin, count, rows);
     for (int64_t i = 0; i < count; ++i) {
       float* const row = rows + i * network.in_stride;
       fill_own(network, begin + i, row);
@@ -158,7 +134,7 @@ void backward_block(const PaddedNetwork& network, const FeatureInputs& inputs, c
     if (gradients.owns) copy(gradients.owns + block.index[i] * own.own, by_features + own.features, own.own);
     if (!gradients.inputs) continue;
     for (int64_t k = 0; k < inputs.count; ++k) {
-      const float* row = row_of(inputs.items[k], block.index[i]);
+      const float* row = inputs.bases + (block.index[i] * inputs.count + k) * own.features;
       store(sums.inputs + 16 * k, load(sums.inputs + 16 * k) + dot(row, by_features, own.features));
     }
   }
@@ -237,15 +213,37 @@ MIEN_INLINE bool untouched(const FactoredUpdate& task, int64_t index) {
   return true;
 }
 
-void update(const FactoredUpdate& task, const float* products, float* steps, int64_t first, int64_t end) {
+// The means of the products of two terms' columns, times 1 - beta2 of Adam. Whether one of the squares is not 0.
+MIEN_INLINE bool fill_products(const FactoredUpdate& task, int64_t index, float* products) {
+  const int terms = task.terms_count, count = task.columns_count;
+  bool any = false;
+  for (int s = 0; s < terms; ++s) {
+    const float* one = task.terms[s].columns_of(index, count);
+    for (int t = 0; t <= s; ++t) {
+      const float* other = task.terms[t].columns_of(index, count);
+      float product = 0;
+      for (int k = 0; k < count; ++k) product += one[k] * other[k];
+      const float mean = product / static_cast<float>(count > 0 ? count : 1);
+      any = any || (s == t && mean > 0);
+      products[s * terms + t] = 0.001f * mean;
+    }
+  }
+  return any;
+}
+
+void update(const FactoredUpdate& task, float* products, float* steps, int64_t first, int64_t end) {
   [[maybe_unused]] const NoDenormals guard;
+  bool by_row = false;
+  for (int t = 0; t < task.terms_count; ++t) by_row = by_row || task.terms[t].places;
+  if (!by_row && !fill_products(task, 0, products)) return;
   for (int64_t index = first; index < end; ++index) {
     if (untouched(task, index)) continue;
+    if (by_row && !fill_products(task, index, products)) continue;
     factor_steps(task, products, index, steps);
     float* values = task.values + index * task.columns_count * task.width;
     for (int k = 0; k < task.columns_count; ++k, values += task.width) {
       for (int t = 0; t < task.terms_count; ++t) {
-        const float column = task.terms[t].columns[k];
+        const float column = task.terms[t].columns_of(index, task.columns_count)[k];
         if (column != 0) add_scaled(steps + t * task.width, -column, task.width, values);
       }
     }

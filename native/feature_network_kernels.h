@@ -26,15 +26,21 @@ struct FeatureSums {
   float* inputs;
 };
 
+// The inputs that are read.
+struct UsedInputs {
+  const int64_t* items;
+  int64_t count;
+};
+
 struct FeatureKernels {
   // `scratch` holds kFeatureBlock rows of each stride.
-  void (*forward)(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept, float* outputs,
-                  float* last, float* scratch, int64_t first, int64_t end);
+  void (*forward)(const PaddedNetwork& network, const FeatureInputs& inputs, const UsedInputs& used,
+                  const FeatureKept& kept, float* outputs, float* last, float* scratch, int64_t first, int64_t end);
   void (*backward)(const PaddedNetwork& network, const FeatureInputs& inputs, const FeatureKept& kept,
                    const FeatureGradients& gradients, const FeatureSums& sums, float* scratch, int64_t first,
                    int64_t end);
-  // `products` [t, t] are the means of the products of two terms' columns. `steps` has room for t rows of factors.
-  void (*update)(const FactoredUpdate& task, const float* products, float* steps, int64_t first, int64_t end);
+  // `products` has room for [t, t] numbers, `steps` for t rows of factors.
+  void (*update)(const FactoredUpdate& task, float* products, float* steps, int64_t first, int64_t end);
 };
 
 }  // namespace mien

@@ -47,7 +47,8 @@ void factored_adam(const FactoredAdamTask& task, int64_t begin, int64_t end) {
       for (int i = 0; i < task.width; i += W) {
         F g{};
         for (int t = 0; t < task.terms_count; ++t) {
-          g = g + load_some(task.terms[t].rows + index * task.width + i, task.width - i) * task.terms[t].columns[k];
+          g = g + load_some(task.terms[t].rows + index * task.width + i, task.width - i) *
+                      task.terms[t].columns_of(index, task.columns_count)[k];
         }
         adam_vector(task, at + i, task.width - i, g);
       }

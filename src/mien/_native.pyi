@@ -247,11 +247,18 @@ class AdamTask(NamedTuple):
     rate: float
 
 def factored_adam_update(
-    values: Tensor, rows: list[Tensor], columns: list[Tensor], first: Tensor, second: Tensor, steps: Tensor, rate: float
+    values: Tensor,
+    rows: list[Tensor],
+    columns: list[Tensor],
+    places: list[Tensor | None],
+    first: Tensor,
+    second: Tensor,
+    steps: Tensor,
+    rate: float,
 ) -> None:
     """Updates `values`, `first` and `second` [n, k, f], and counts the step.
 
-    The gradient is the sum of rows [n, f] times columns [k] over all terms.
+    The gradient is the sum over all terms of rows [n, f] times columns: the first of [g, k], or those at places [n].
     """
 
 def adam_update(tasks: Sequence[AdamTask | tuple[Any, Any, Any, Any, Any, float]]) -> None: ...
@@ -399,14 +406,23 @@ def bake_texture(
 
 def light_equations(surface: AlignSurface, sighting: SightingArrays, hessian: Tensor, right: Tensor) -> None: ...
 
-# native/bind_expression_change.cpp; basis: [.., r], its values: [..]
-def expression_activations(inputs: Tensor, rest: Tensor, directions: Tensor, seen: Tensor, out: Tensor) -> None: ...
-def expression_activations_backward(
-    inputs: Tensor, rest: Tensor, directions: Tensor, seen: Tensor, gradient: Tensor, grad_inputs: Tensor
-) -> None: ...
-def expression_change(basis: Tensor, activations: Tensor, out: Tensor) -> None: ...
+# native/bind_expression_change.cpp
+def expression_activations(
+    inputs: Tensor, rest: Tensor, directions: Tensor, seen: Tensor, block: int, out: Tensor
+) -> None:
+    """Fills `out` [r]. `block` activations, a divisor of r, are shortened together."""
+
+def head_motion(rest: Tensor, pose: Tensor, out: Tensor) -> None:
+    """Fills `out` [6]: sines of turns, then a shift in metres. Poses [6] are an axis-angle vector, then a place."""
+
+def blend_regions(shares: Tensor, table: Tensor, out: Tensor) -> None:
+    """Fills `out` [n, k], shares [n, g] times table [g, k]."""
+
+def expression_change(basis: Tensor, activations: Tensor, rows: Tensor | None, out: Tensor) -> None:
+    """Fills `out` [n, ..], of a basis [n, .., r] and rows [n] of activations [g, r], the first if there are none."""
+
 def expression_change_backward(
-    basis: Tensor, activations: Tensor, gradient: Tensor, grad_basis: Tensor, grad_activations: Tensor
+    activations: Tensor, rows: Tensor | None, gradient: Tensor, grad_basis: Tensor
 ) -> None: ...
 
 # native/bind_activation.cpp; any shape
@@ -424,9 +440,11 @@ class FeatureNetwork(NamedTuple):
 
 class FeatureBases(NamedTuple):
     values: Tensor
-    """[n, k, f], or [k, n, f] with `by_input`."""
+    """[n, k, f]"""
     inputs: Tensor
-    by_input: bool
+    """[g, k]"""
+    rows: Tensor | None
+    """[n], the inputs' row of each Gaussian. None stands for the first."""
 
 class FeatureKept(NamedTuple):
     features: Tensor
@@ -450,20 +468,23 @@ class FeatureGradients(NamedTuple):
     """[n, x], of the Gaussians' own numbers. Without rows if it is not wanted."""
 
 def feature_network(
-    network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept | None, outputs: Tensor, last: Tensor
+    network: FeatureNetwork, bases: FeatureBases, kept: FeatureKept | None, outputs: Tensor, last: Tensor
 ) -> None:
     """Fills `kept`, `outputs` [n, o - 1] and `last` [n]."""
 
 def feature_network_backward(
-    network: FeatureNetwork, bases: Sequence[FeatureBases], kept: FeatureKept, gradients: FeatureGradients
+    network: FeatureNetwork, bases: FeatureBases, kept: FeatureKept, gradients: FeatureGradients
 ) -> None: ...
 def factored_update(
-    values: Tensor, rows: list[Tensor], columns: list[Tensor], second: Tensor, weights: Tensor, rate: float
+    values: Tensor,
+    rows: list[Tensor],
+    columns: list[Tensor],
+    places: list[Tensor | None],
+    second: Tensor,
+    weights: Tensor,
+    rate: float,
 ) -> None:
-    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n].
-
-    The gradient is the sum of rows [n, f] times columns [k] over all terms.
-    """
+    """Updates `values` [n, k, f], `second` [n, f] and `weights` [n], by a gradient as in `factored_adam_update`."""
 
 # native/bind_point_network.cpp; n points, l layers
 class PointLayer(NamedTuple):

@@ -1,10 +1,10 @@
 """Adam's state for one tensor, which training and the paper's tracking share. Each has its own update."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 BETA1, BETA2 = 0.9, 0.999
@@ -57,6 +57,14 @@ class FactoredMoments:
         return FactoredMoments(torch.zeros_like(like[:, 0]), like.new_zeros(len(like)))
 
 
+class FactoredTerm(NamedTuple):
+    """An outer product: adds rows[n, f] columns[k], or with `places` each row's own columns out of a table [g, k]."""
+
+    rows: Float[Tensor, "n f"]
+    columns: Float[Tensor, "*g k"]
+    places: Int[Tensor, " n"] | None = None
+
+
 @dataclass(eq=False)
 class FactoredGradient:
     """The gradient of a tensor [n, k, f] as a sum of outer products, so that it is never made. Mutable.
@@ -64,10 +72,9 @@ class FactoredGradient:
     A backward pass adds to it and the optimiser clears it, like `Tensor.grad`.
     """
 
-    terms: list[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]] = field(default_factory=list)
-    """Rows and columns: each term adds rows[n, f] columns[k]."""
+    terms: list[FactoredTerm] = field(default_factory=list)
 
-    def take(self) -> list[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]:
+    def take(self) -> list[FactoredTerm]:
         """Return the terms, and clear them."""
         terms, self.terms = self.terms, []
         return terms

@@ -26,18 +26,27 @@ export interface Attributes {
 /** Features of w numbers that the activations blend, and a network of two layers that makes changes of them. */
 export interface FeatureChanges {
   neutral: Float32Array; // [n, w]
-  basis: Float32Array; // [n, r, w]
+  basis: Float32Array; // [n, a, w]
   own: Float32Array; // [n, _], further inputs of the network
   weights: Float32Array[]; // of both layers, [out, in]
   biases: Float32Array[];
 }
 
-/** Changes of the raw values with the expression, of low rank r. */
+/** q activations of the head's pose. */
+export interface HeadActivations {
+  rest: Float32Array; // [6], axis-angle vector and place of the head at rest
+  directions: Float32Array; // [6, q]
+  seen: Float32Array; // [s, q]
+}
+
+/** Changes of the raw values with the expression, of low rank. */
 export interface ExpressionChanges {
   rest: Float32Array; // [i]
-  directions: Float32Array; // [i, r]
+  directions: Float32Array; // [i, r]: r / g activations of each of g regions of the face
   seen: Float32Array; // [s, r], activations that training saw
-  color: Float32Array | null; // [n, 3, c], where the first c of the r activations count
+  shares: Float32Array | null; // [f, g], of each region in each triangle. Null if the face is one region
+  head: HeadActivations | null;
+  color: Float32Array | null; // [n, 3, c], where the first c of a Gaussian's a activations count
   opacity_logits: Float32Array | null; // [n, c]
   means: Float32Array | null; // [n, 3, c]
   features: FeatureChanges | null;

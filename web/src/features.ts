@@ -6,7 +6,14 @@ import type { FeatureChanges } from "./avatar";
 /** Slope of the hidden layer below zero. */
 export const SLOPE = 0.01;
 
-/** The sizes of a network: Gaussians, features, directions of the face, hidden units. */
+/** Activations of the face: the row of each Gaussian in a table of rows of `width` numbers. */
+export interface Activations {
+  table: ArrayLike<number>;
+  rows: Int32Array; // [n]
+  width: number;
+}
+
+/** The sizes of a network: features, a Gaussian's activations, hidden units. */
 export function sizesOf({ neutral, basis, biases }: FeatureChanges, count: number): { width: number; rank: number; hidden: number } {
   const width = neutral.length / Math.max(count, 1);
   return { width, rank: basis.length / Math.max(neutral.length, 1), hidden: biases[0].length };
@@ -42,14 +49,13 @@ export class FeatureNetwork {
   }
 
   /** Adds the changes at these activations to first colour coefficients [n, 3] and raw opacities [n]. */
-  add(activations: ArrayLike<number>, colors: Float32Array, opacityLogits: Float32Array): void {
+  add({ table, rows }: Activations, colors: Float32Array, opacityLogits: Float32Array): void {
     const { count, width, rank, hidden, first, own } = this, { neutral, basis, weights, biases } = this.features;
-    const second = weights[1], bias = biases[1], blended = new Float32Array(width), active = new Float32Array(rank);
-    active.set(activations);
+    const second = weights[1], bias = biases[1], blended = new Float32Array(width);
     for (let i = 0; i < count; ++i) {
       for (let f = 0; f < width; ++f) blended[f] = neutral[i * width + f];
       for (let k = 0, b = i * rank * width; k < rank; ++k, b += width) {
-        const a = active[k];
+        const a = table[rows[i] * rank + k];
         if (a !== 0) for (let f = 0; f < width; ++f) blended[f] += a * basis[b + f];
       }
       let red = bias[0], green = bias[1], blue = bias[2], opacity = bias[3];

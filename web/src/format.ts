@@ -2,6 +2,7 @@
 
 import type { Avatar, BlendSkinned, ExpressionChanges, Face, LinearBases, MeshBound, Motion, Rig, Static } from "./avatar";
 import { WIDTHS } from "./points";
+import { layoutOf } from "./rig";
 
 type Numbers = Float32Array | Int32Array;
 type Tree = null | boolean | number | string | Tree[] | { [key: string]: Tree };
@@ -204,13 +205,16 @@ function isRig(rig: Rig, { expression, joints }: Face): boolean {
 }
 
 /** Whether changes with the face fit a face and `count` Gaussians. */
-function isChanges(changes: ExpressionChanges, { expression, joints }: Face, count: number): boolean {
-  const { rest, directions, seen, features } = changes, rank = directions.length / rest.length;
+function isChanges(changes: ExpressionChanges, { expression, joints }: Face, count: number, triangles: number): boolean {
+  const { rest, directions, seen, features, shares, head } = changes, rank = directions.length / rest.length;
   if (!fits(changes, { rest: expression.length + joints.length, seen: rank * Math.floor(seen.length / rank) })) return false;
+  const { regions, own: ofRegion, width } = layoutOf(changes, triangles), turns = width - ofRegion;
+  if (!Number.isInteger(regions) || !Number.isInteger(ofRegion) || (shares && !fits(changes, { shares: regions * triangles }))) return false;
+  if (head && !fits(head, { rest: 6, directions: 6 * turns, seen: turns * Math.floor(head.seen.length / Math.max(turns, 1)) })) return false;
   if (!features) return true;
   const { neutral, own, weights, biases } = features, hidden = biases[0].length;
   return (
-    weights.length === 2 && biases.length === 2 && fits(features, { basis: rank * neutral.length }) && fits(biases, { 0: hidden, 1: 4 }) &&
+    weights.length === 2 && biases.length === 2 && fits(features, { basis: width * neutral.length }) && fits(biases, { 0: hidden, 1: 4 }) &&
     fits(weights, { 0: (hidden * (neutral.length + own.length)) / Math.max(count, 1), 1: 4 * hidden })
   );
 }
@@ -220,7 +224,7 @@ const isIndices = (indices: Int32Array, size: number): boolean => indices instan
 /** Whether Gaussians fit their triangles, and a face. */
 const isBound = ({ rig, faces, face_index, means, changes }: MeshBound, neutral: Face, count: number): boolean =>
   isIndices(faces, rig.template.length / 3) && isIndices(face_index, faces.length / 3) && face_index.length === count && means.length === 3 * count &&
-  isRig(rig, neutral) && (!changes || isChanges(changes, neutral, count));
+  isRig(rig, neutral) && (!changes || isChanges(changes, neutral, count, faces.length / 3));
 
 /** Whether points, and what changes their attributes, fit a face and `count` Gaussians. */
 function isFree(baked: BlendSkinned | Static, neutral: Face, count: number): boolean {

@@ -5,8 +5,8 @@ import type { ExpressionChanges, FeatureChanges, MeshBound } from "./avatar";
 import { ownPart, sizesOf } from "./features";
 import { AvatarError } from "./format";
 import { dispatch, type Memory } from "./gpu_memory";
-import { CHANGE, FRAMES, MOST_RANK, THREADS, featureNetwork } from "./gpu_shaders";
-import type { Poser } from "./rig";
+import { FRAMES, MOST_RANK, THREADS, change, featureNetwork } from "./gpu_shaders";
+import { type Poser, layoutOf } from "./rig";
 
 /** TypeScript has no type of it yet. Browsers have it since 2025. */
 declare const Float16Array: undefined | (new (from: Float32Array) => { buffer: ArrayBuffer });
@@ -49,12 +49,14 @@ export class GpuPoser {
     words[1] = triangles;
     this.frames = this.step(FRAMES, triangles, [this.pose, this.points, memory.storage(faces), posed.frames]);
     if (!changes) return;
-    if (changes.directions.length / changes.rest.length > MOST_RANK) throw new AvatarError(`has more than ${MOST_RANK} activations`);
+    const { regions, width } = layoutOf(changes, triangles);
+    if (regions * width > MOST_RANK) throw new AvatarError(`has more than ${MOST_RANK} activations`);
+    const shares = memory.storage(changes.shares ?? new Float32Array(triangles).fill(1));
     const { basis, columns } = basisOf(changes, count);
     words[2] = columns;
     const rest = [means, colors].map((values) => memory.storage(values));
-    this.changes.push(this.step(CHANGE, count, [this.pose, ...rest, memory.storage(basis), posed.means, posed.colors]));
-    if (changes.features) this.addNetwork(changes.features, count, posed.colors);
+    this.changes.push(this.step(change(regions, width), count, [this.pose, ...rest, memory.storage(basis), posed.means, posed.colors, shares]));
+    if (changes.features) this.addNetwork(changes.features, count, regions, [posed.colors, shares, posed.means]);
   }
 
   /** Poses the Gaussians of the poser's last face. */
@@ -73,7 +75,7 @@ export class GpuPoser {
     device.queue.submit([encoder.finish()]);
   }
 
-  private addNetwork(features: FeatureChanges, count: number, colors: GPUBuffer): void {
+  private addNetwork(features: FeatureChanges, count: number, regions: number, last: GPUBuffer[]): void {
     const { memory } = this, { width, rank, hidden } = sizesOf(features, count), { weights, biases } = features;
     const texels = Math.ceil(width / 4), units = 4 * Math.ceil(hidden / 4), columns = weights[0].length / hidden;
     // For each hidden unit: its weights of the features, then those of the four outputs.
@@ -87,7 +89,7 @@ export class GpuPoser {
     const half = (values: Float32Array, row: number) => memory.storage(halves(padded(values, row)));
     const own = half(ownPart(features, count, width), hidden);
     const inputs = [half(features.neutral, width), half(features.basis, width), own, memory.storage(table)];
-    this.changes.push(this.step(featureNetwork(texels, rank, units), count, [this.pose, ...inputs, colors]));
+    this.changes.push(this.step(featureNetwork(texels, rank, units, regions), count, [this.pose, ...inputs, ...last]));
   }
 
   private step(code: string, threads: number, buffers: GPUBuffer[]): Step {

@@ -9,15 +9,26 @@ export const TILE = 1024;
 /** Most activations of an avatar. */
 export const MOST_RANK = 128;
 
-/** What the passes know of a face. */
+/** What the passes know of a face: activations [g, a] of the regions. */
 const POSE = `
 struct Pose {
   count: u32, triangles: u32, columns: u32,
   bias: vec4f,  // of the network's outputs
   activations: array<vec4f, ${MOST_RANK / 4}>,
 }
-@group(0) @binding(0) var<uniform> pose: Pose;
-fn activation(k: u32) -> f32 { return pose.activations[k >> 2][k & 3]; }`;
+@group(0) @binding(0) var<uniform> pose: Pose;`;
+
+/** The activations of Gaussians in a triangle, which `regions` share, each with `width` of them. `binding` has the shares. */
+const activation = (regions: number, width: number, binding: number): string => `
+@group(0) @binding(${binding}) var<storage, read> shares: array<f32>;
+fn activation(triangle: u32, k: u32) -> f32 {
+  var sum = 0.;
+  for (var g = 0u; g < ${regions}; g++) {
+    let at = g * ${width} + k;
+    sum += shares[triangle * ${regions} + g] * pose.activations[at >> 2][at & 3];
+  }
+  return sum;
+}`;
 
 /** Frames of triangles: `triangleFrames` of rig.ts. */
 export const FRAMES = `${POSE}
@@ -49,7 +60,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
 }`;
 
 /** Centres, first colours and raw opacities at the activations. A basis has centres and opacity, then colours. */
-export const CHANGE = `${POSE}
+export const change = (regions: number, width: number): string => `${POSE}${activation(regions, width, 6)}
 @group(0) @binding(1) var<storage, read> restMeans: array<vec4f>;
 @group(0) @binding(2) var<storage, read> restColors: array<vec4f>;
 @group(0) @binding(3) var<storage, read> basis: array<vec4f>;
@@ -63,7 +74,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
   var mean = restMeans[i];
   var color = restColors[i];
   for (var k = 0u; k < pose.columns; k++) {
-    let a = activation(k); let first = basis[2 * (i * pose.columns + k)];
+    let a = activation(u32(mean.w), k); let first = basis[2 * (i * pose.columns + k)];
     mean += a * vec4f(first.xyz, 0);
     color += a * vec4f(basis[2 * (i * pose.columns + k) + 1].xyz, first.w);
   }
@@ -71,24 +82,26 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
   colors[i] = color;
 }`;
 
-/** Adds the network of features.ts: with `texels` of features, `rank` directions, `hidden` units. */
-export function featureNetwork(texels: number, rank: number, hidden: number): string {
-  return `${POSE}
+/** Adds the network of features.ts: with `texels` of features, `rank` activations of each of `regions`, `hidden` units. */
+export function featureNetwork(texels: number, rank: number, hidden: number, regions: number): string {
+  return `${POSE}${activation(regions, rank, 6)}
 @group(0) @binding(1) var<storage, read> neutral: array<vec2u>;
 @group(0) @binding(2) var<storage, read> basis: array<vec2u>;
 @group(0) @binding(3) var<storage, read> own: array<vec2u>;
 @group(0) @binding(4) var<storage, read> weights: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> colors: array<vec4f>;
+@group(0) @binding(7) var<storage, read> means: array<vec4f>;  // and the triangle
 fn four(halves: vec2u) -> vec4f { return vec4f(unpack2x16float(halves.x), unpack2x16float(halves.y)); }
 
 @compute @workgroup_size(${THREADS})
 fn main(@builtin(global_invocation_id) id: vec3u) {
   let i = id.x;
   if (i >= pose.count) { return; }
+  let triangle = u32(means[i].w);
   var f: array<vec4f, ${texels}>;
   for (var t = 0u; t < ${texels}; t++) { f[t] = four(neutral[i * ${texels} + t]); }
   for (var k = 0u; k < ${rank}; k++) {
-    let a = activation(k);
+    let a = activation(triangle, k);
     if (a != 0) {
       for (var t = 0u; t < ${texels}; t++) { f[t] += a * four(basis[(i * ${rank} + k) * ${texels} + t]); }
     }

@@ -3,7 +3,7 @@
 
 import type { AttributeNetwork, BlendSkinned, Face, LinearBases, Static } from "./avatar";
 import { SLOPE } from "./features";
-import { RigPoser, activations } from "./rig";
+import { RigPoser, activations, inputsOf } from "./rig";
 import { chained, moved, rigid, rotationMatrix, transposed } from "./rigid";
 
 const SH_C0 = 0.28209479177387814;
@@ -64,7 +64,7 @@ export class PointPoser {
   private addNetwork({ base, weights, biases, activation, outputs, along }: AttributeNetwork, face: Face): void {
     const { layers, parts } = this, { rest, to } = parts.means, count = rest.length / 3, found = layers[biases.length];
     const own = base.length / count, [inputs] = layers, { basis } = along ?? { basis: [] };
-    const strengths = along ? activations(along, face) : [], features = basis.length / count / strengths.length;
+    const strengths = along ? activations(inputsOf(face), along) : [], features = basis.length / count / strengths.length;
     for (let i = 0, b = 0; i < count; ++i) {
       inputs.set(base.subarray(i * own, (i + 1) * own));
       for (const strength of strengths) for (let f = 0; f < features; ++f) inputs[f] += strength * basis[b++];

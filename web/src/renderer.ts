@@ -104,8 +104,7 @@ export class Renderer implements Drawer {
       sh.values.set(attributes.sh.subarray(from, from + 3), 4 * i);
     }
     sh.upload();
-    const features = poser.bound?.changes?.features;
-    this.features = features ? FeaturePass.on(gl, features, this.count) : null;
+    this.features = FeaturePass.on(gl, poser.bound);
     poser.runsNetwork = !this.features;
     this.uploadChanged();
     this.order = gl.createBuffer()!;

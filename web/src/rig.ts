@@ -1,10 +1,10 @@
 // Posing on the CPU: points of the rig, frames of triangles, changes with the expression, depths. It follows
 // src/mien/runtime/posing.py, FaceModel.head_vertices_reference and triangle_frames.
 
-import type { Baked, ExpressionChanges, Face, FeatureDirections, MeshBound, Rig } from "./avatar";
-import { FeatureNetwork } from "./features";
+import type { Baked, ExpressionChanges, Face, HeadActivations, MeshBound, Rig } from "./avatar";
+import { type Activations, FeatureNetwork } from "./features";
 import { PointPoser } from "./points";
-import { chained, rigid, rotationMatrix } from "./rigid";
+import { chained, multiplied, rigid, rotationMatrix, transposed } from "./rigid";
 
 /** Rows of a basis [rows, m, 3] without its zeros: most expressions move a small part of the face. */
 class SparseBasis {
@@ -146,27 +146,65 @@ export function triangleFrames(points: Float32Array, faces: Int32Array, out: Flo
 /** How far activations get beyond what training saw along them, as a share of it, as in native/expression_change.cpp. */
 const MARGIN = 0.1;
 
-/** The r activations of a face, shortened to what training saw. */
-export function activations({ rest, directions }: FeatureDirections | ExpressionChanges, face: Face, seen?: Float32Array): Float64Array {
-  const inputs = [...face.expression, ...face.joints], rank = directions.length / inputs.length, out = new Float64Array(rank);
+/** What activations are made of. */
+export interface Directions {
+  rest: ArrayLike<number>; // [i]
+  directions: Float32Array; // [i, r]
+}
+
+/** (inputs - rest) directions, in each of some regions shortened to what training saw. */
+export function activations(inputs: number[], { rest, directions }: Directions, seen?: Float32Array, regions = 1): Float64Array {
+  const rank = directions.length / inputs.length, block = rank / regions, out = new Float64Array(rank);
   inputs.forEach((input, i) => {
     for (let k = 0; k < rank; ++k) out[k] += (input - rest[i]) * directions[i * rank + k];
   });
-  if (!seen?.length) return out;
-  const along = (row: ArrayLike<number>, from: number) => out.reduce((sum, x, k) => sum + x * row[from + k], 0);
-  let furthest = 1e-6;
-  for (let from = 0; from < seen.length; from += rank) furthest = Math.max(furthest, along(seen, from));
-  const ratio = along(out, 0) / furthest, over = ratio - 1;
-  return over > 0 ? out.map((x) => (x * (1 + (MARGIN * over) / (MARGIN + over))) / ratio) : out;
+  for (let begin = 0; seen?.length && begin < rank; begin += block) {
+    const own = out.subarray(begin, begin + block), along = (row: ArrayLike<number>, from: number) => own.reduce((sum, x, k) => sum + x * row[from + k], 0);
+    let furthest = 1e-6;
+    for (let from = begin; from < seen.length; from += rank) furthest = Math.max(furthest, along(seen, from));
+    const ratio = along(own, 0) / furthest, over = ratio - 1;
+    if (over > 0) own.forEach((x, k) => (own[k] = (x * (1 + (MARGIN * over) / (MARGIN + over))) / ratio));
+  }
+  return out;
 }
 
-/** raw + basis times the first activations, into `out`. */
-function changed(raw: Float32Array, basis: Float32Array | null, weights: Float64Array, out: Float32Array): void {
+/** The inputs of a face: its coefficients, then the angles of its joints. */
+export const inputsOf = (face: Face): number[] => [...face.expression, ...face.joints];
+
+/** How the head moved from its pose at rest: sines of its turns about its own axes there, then its shift. */
+function headMotion({ rest }: HeadActivations, face: Face): number[] {
+  const back = transposed(rotationMatrix(rest, 0)), R = multiplied(back, rotationMatrix(face.head_rotation, 0));
+  const [x, y, z] = [0, 1, 2].map((axis) => face.head_translation[axis] - rest[3 + axis]);
+  const shift = [0, 3, 6].map((row) => back[row] * x + back[row + 1] * y + back[row + 2] * z);
+  return [(R[7] - R[5]) / 2, (R[2] - R[6]) / 2, (R[3] - R[1]) / 2, ...shift];
+}
+
+/** The sizes of a face's activations: regions, and the activations of a Gaussian, of its region and of the head. */
+export function layoutOf({ rest, directions, shares, head }: ExpressionChanges, triangles: number): { regions: number; own: number; width: number } {
+  const regions = shares ? shares.length / Math.max(triangles, 1) : 1, own = directions.length / rest.length / regions;
+  return { regions, own, width: own + (head ? head.directions.length / 6 : 0) };
+}
+
+/** A row of a Gaussian's activations for each region [g, a]: one of the region and one of the head in turn, as long as there are both. */
+function tableOf(changes: ExpressionChanges, face: Face, { regions, own, width }: ReturnType<typeof layoutOf>): Float64Array {
+  const found = activations(inputsOf(face), changes, changes.seen, regions), { head } = changes, out = new Float64Array(regions * width);
+  const pose = head ? activations(headMotion(head, face), { rest: new Float64Array(6), directions: head.directions }, head.seen) : [];
+  for (let region = 0, o = 0; region < regions; ++region)
+    for (let k = 0; k < Math.max(own, width - own); ++k) {
+      if (k < own) out[o++] = found[region * own + k];
+      if (k < width - own) out[o++] = pose[k];
+    }
+  return out;
+}
+
+/** raw + basis times the first activations of each Gaussian's triangle, into `out`. */
+function changed(raw: Float32Array, basis: Float32Array | null, { table, rows, width }: Activations, out: Float32Array): void {
   if (!basis) return;
-  const rank = basis.length / Math.max(out.length, 1);
+  const rank = basis.length / Math.max(out.length, 1), each = out.length / Math.max(rows.length, 1);
   for (let i = 0, b = 0; i < out.length; ++i) {
+    const from = width * rows[Math.floor(i / each)];
     let sum = raw[i];
-    for (let k = 0; k < rank; ++k) sum += basis[b++] * weights[k];
+    for (let k = 0; k < rank; ++k) sum += basis[b++] * table[from + k];
     out[i] = sum;
   }
 }
@@ -192,8 +230,9 @@ export class Poser {
   /** The mesh's points in the head frame. */
   points: Float32Array = new Float32Array();
   private readonly rig: RigPoser | null = null;
-  /** The activations of the changes at the last face. */
+  /** The activations of the changes at the last face: a row for each region of the face. */
   activations: Float64Array = new Float64Array();
+  private readonly layout = { regions: 1, own: 0, width: 0 };
   /** Whether the last face has changed means, colours or opacities. */
   changed = false;
   /** Whether posing runs the network of features. Not where the renderer runs it on the GPU. */
@@ -225,7 +264,8 @@ export class Poser {
     // A single triangle is not the head: it is the frame of Gaussians that do not move.
     if (faces.length > 3) this.rest = rig.template;
     this.rig = new RigPoser(rig);
-    if (changes) this.activations = new Float64Array(changes.directions.length / changes.rest.length);
+    if (changes) this.layout = layoutOf(changes, faces.length / 3);
+    this.activations = new Float64Array(this.layout.regions * this.layout.width);
     if (features) this.network = new FeatureNetwork(features, count);
   }
 
@@ -240,20 +280,32 @@ export class Poser {
     if (this.binds) triangleFrames(this.points, bound.faces, this.frames);
     const { changes, attributes } = bound;
     if (!changes) return;
-    const weights = activations(changes, face, changes.seen), before = this.activations;
+    const weights = tableOf(changes, face, this.layout), before = this.activations;
     this.activations = weights;
-    // Turns of the head alone change none of this.
     this.changed = !this.posed || weights.some((weight, k) => weight !== before[k]);
     if (!this.changed) return;
     this.posed = true;
     if (!this.binds) return;
-    changed(bound.means, changes.means, weights, this.means);
-    changed(attributes.opacity_logits, changes.opacity_logits, weights, this.opacityLogits);
-    changed(this.restColors, changes.color, weights, this.colors);
+    const all = this.ofTriangles(changes.shares);
+    changed(bound.means, changes.means, all, this.means);
+    changed(attributes.opacity_logits, changes.opacity_logits, all, this.opacityLogits);
+    changed(this.restColors, changes.color, all, this.colors);
     if (!this.network || !this.runsNetwork) return;
     if (!changes.opacity_logits) this.opacityLogits.set(attributes.opacity_logits);
     if (!changes.color) this.colors.set(this.restColors);
-    this.network.add(weights, this.colors, this.opacityLogits);
+    this.network.add(all, this.colors, this.opacityLogits);
+  }
+
+  /** The activations of each triangle, as the regions share it. */
+  private ofTriangles(shares: Float32Array | null): Activations {
+    const { regions, width } = this.layout, triangles = shares ? shares.length / regions : this.frames.length / 12;
+    const table = new Float64Array(triangles * width);
+    for (let f = 0; f < triangles; ++f)
+      for (let region = 0; region < regions; ++region) {
+        const share = shares ? shares[f * regions + region] : 1;
+        if (share) for (let k = 0; k < width; ++k) table[f * width + k] += share * this.activations[region * width + k];
+      }
+    return { table, rows: this.faceIndex, width };
   }
 
   /** Depths of the centres along a row of a view of the head frame: x view[0] + y view[1] + z view[2] + view[3]. */

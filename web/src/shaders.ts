@@ -118,12 +118,12 @@ void main() {
 /** Width of the textures that hold the arrays of features. Every WebGL2 device has at least 2048. */
 export const FEATURE_WIDTH = 2048;
 
-/** The network of features.ts at one pixel for each Gaussian: with `texels` of features, `rank` directions, `hidden` units. */
-export function featureFragment(texels: number, rank: number, hidden: number): string {
+/** The network of features.ts at one pixel for each Gaussian: with `texels` of features, `rank` activations, `hidden` units, `fours` of regions. */
+export function featureFragment(texels: number, rank: number, hidden: number, fours: number): string {
   return `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D;
-uniform sampler2D u_rest, u_neutral, u_basis, u_own, u_weights;
-uniform float u_activations[${rank}];
+uniform sampler2D u_rest, u_neutral, u_basis, u_own, u_weights, u_shares;
+uniform vec4 u_activations[${rank * fours}];
 uniform vec4 u_bias;
 uniform int u_count;
 out vec4 o_color;
@@ -134,8 +134,11 @@ void main() {
   if (i >= u_count) discard;
   vec4 f[${texels}];
   for (int t = 0; t < ${texels}; ++t) f[t] = at(u_neutral, i * ${texels} + t);
+  vec4 shares[${fours}];
+  for (int s = 0; s < ${fours}; ++s) shares[s] = at(u_shares, i * ${fours} + s);
   for (int k = 0; k < ${rank}; ++k) {
-    float a = u_activations[k];
+    float a = 0.;
+    for (int s = 0; s < ${fours}; ++s) a += dot(shares[s], u_activations[k * ${fours} + s]);
     if (a != 0.) for (int t = 0; t < ${texels}; ++t) f[t] += a * at(u_basis, (i * ${rank} + k) * ${texels} + t);
   }
   vec4 sum = u_bias;

@@ -9,7 +9,8 @@ fields, so neither can change.
 
 Letters in shapes mean the same in the whole file: n Gaussians, m points of the rig, f triangles, e expressions, k
 joints, j free joints, p pose correctives (9 per free joint), s SH coefficients per channel, r activations or directions
-of the face, c of these that bases take, w features, i inputs (e expression coefficients, then 3 j angles).
+of the face, q of the head's pose, g regions of the face, a activations of one Gaussian, c of these that bases take, w
+features, i inputs (e expression coefficients, then 3 j angles).
 `mien.runtime.checks` compares arrays with these letters.
 """
 
@@ -105,7 +106,7 @@ class FeatureChanges:
 
     neutral: Float32[np.ndarray, "n w"]
     """Features of each Gaussian."""
-    basis: Float32[np.ndarray, "n r w"]
+    basis: Float32[np.ndarray, "n a w"]
     """Change of the features per unit of each activation."""
     own: Float32[np.ndarray, "n _"]
     """Numbers of each Gaussian that go into the network after its features."""
@@ -115,12 +116,30 @@ class FeatureChanges:
 
 
 @dataclass(frozen=True, eq=False)
+class HeadActivations:
+    """Activations of the head's pose, by how far the head moved from its pose at rest: six numbers.
+
+    They are the sines of its turns about its own axes there, (R - R^T) / 2 of its rotation R, and its shift along these
+    axes, in metres. `_native.head_motion` computes them. `directions` and `seen` are as in `ExpressionChanges`.
+    """
+
+    rest: Float32[np.ndarray, " 6"]
+    """Axis-angle vector of the head at rest, in radians, and its place, in metres."""
+    directions: Float32[np.ndarray, "6 q"]
+    seen: Float32[np.ndarray, "_ q"]
+
+
+@dataclass(frozen=True, eq=False)
 class ExpressionChanges:
     """Changes of the raw values with the expression, of low rank. A part that is None does not change.
 
-    The activations a are (inputs - rest) directions, and d is their length. The furthest that a row of `seen` goes
-    along them is l = max (seen a) / d. If d is beyond l, they are shortened to the length l + m o / (m + o), with
-    o = d - l and m = l / 10. `_native.expression_activations` computes this.
+    The activations of the face are (inputs - rest) directions: r/g for each of g regions, one region after the other.
+    Let x be those of a region, and d their length. The furthest that a row of `seen` goes along them is
+    l = max (seen x) / d. If d is beyond l, they are shortened to the length l + m o / (m + o), with o = d - l and
+    m = l / 10. `_native.expression_activations` computes this.
+
+    A triangle has the sum of the regions' activations weighted by `shares`, and those of the head's pose. A Gaussian
+    has the activations of its triangle: one of the face and one of the head in turn, as long as there are both.
     """
 
     rest: Float32[np.ndarray, " i"]
@@ -128,7 +147,7 @@ class ExpressionChanges:
     directions: Float32[np.ndarray, "i r"]
     seen: Float32[np.ndarray, "_ r"]
     """Activations that are allowed: those of training frames that go furthest along one of these, and a fifth
-    more. No rows shorten nothing."""
+    more. They are 0 outside of one region. No rows shorten nothing."""
     color: Float32[np.ndarray, "n 3 c"] | None = None
     """Changes of the first SH coefficient per unit of each activation."""
     opacity_logits: Float32[np.ndarray, "n c"] | None = None
@@ -137,8 +156,11 @@ class ExpressionChanges:
     features: FeatureChanges | None = None
     """Further changes of colours and opacities."""
     basis_columns: int | None = None
-    """Number of columns c of colour, opacity_logits and means, which the first c activations weight. None if they have
-    all r."""
+    """Number of columns c of colour, opacity_logits and means, which a Gaussian's first c activations weight. None if
+    they have all a."""
+    shares: Float32[np.ndarray, "f g"] | None = None
+    """Share of each region in each triangle; the sum is 1. None if the whole face is one region."""
+    head: HeadActivations | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,6 @@ from mien.runtime.baked import (
 
 MAX_SHAPES = 256
 """Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
-MAX_ACTIVATIONS = 8
-"""Largest number of activations that native/expression_change.h accepts, for parts other than features."""
 _MAX_NAME = 1000
 """Most characters of a name or of another text."""
 _MAX_LOG_SCALE = 30
@@ -97,8 +95,11 @@ def _sizes(baked: BakedAvatar) -> dict[str, int]:
     if isinstance(baked, BlendSkinned):
         sizes["m"] = n
     if isinstance(baked, MeshBound) and baked.changes is not None:
-        r = baked.changes.directions.shape[-1]
-        sizes |= {"r": r, "c": r if baked.changes.basis_columns is None else baked.changes.basis_columns}
+        changes, q = baked.changes, 0 if baked.changes.head is None else baked.changes.head.directions.shape[-1]
+        g = 1 if changes.shares is None else changes.shares.shape[-1]
+        a = changes.directions.shape[-1] // max(g, 1) + q
+        sizes |= {"r": changes.directions.shape[-1], "q": q, "g": g, "f": len(baked.faces)}
+        sizes |= {"a": a, "c": a if changes.basis_columns is None else changes.basis_columns}
     return sizes
 
 
@@ -134,7 +135,7 @@ def _baked_faults(baked: BakedAvatar, sizes: dict[str, int]) -> Iterator[str]:
         yield fault
         return
     if isinstance(baked, MeshBound) and baked.changes is not None:
-        yield from _changes_faults(baked.changes, sizes["r"], sizes["c"])
+        yield from _changes_faults(baked.changes, sizes)
     yield from _array_faults(baked, sizes, "baked")
     attributes = baked.attributes
     if not np.abs(attributes.log_scales).max(initial=0) <= _MAX_LOG_SCALE:
@@ -161,11 +162,12 @@ def _baked_faults(baked: BakedAvatar, sizes: dict[str, int]) -> Iterator[str]:
         yield from _network_faults(baked.network, attributes)
 
 
-def _changes_faults(changes: ExpressionChanges, r: int, c: int) -> Iterator[str]:
-    # Features are blended by another operation, which takes any number of activations.
-    limited = any(part is not None for part in (changes.color, changes.opacity_logits, changes.means))
-    if r < 1 or not 1 <= c <= r or (limited and c > MAX_ACTIVATIONS):
-        yield f"its changes with the expression have {c} of {r} activations, not 1 to {MAX_ACTIVATIONS}"
+def _changes_faults(changes: ExpressionChanges, sizes: dict[str, int]) -> Iterator[str]:
+    r, g, a, c = (sizes[name] for name in "rgac")
+    if r < 1 or g < 1 or r % g != 0:
+        yield f"its changes with the expression have {r} activations of {g} regions"
+    elif not 1 <= c <= a:
+        yield f"its changes with the expression take {c} of {a} activations"
     elif changes.features is not None:
         yield from _features_faults(changes.features)
 

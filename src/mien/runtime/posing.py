@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32, Int64
 
 from mien import _native
 from mien.runtime.baked import (
@@ -165,7 +165,7 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
     pose, raw = face.T_world_head, baked.attributes
     local_means, opacity_logits, sh = baked.means, raw.opacity_logits, raw.sh
     if baked.changes is not None:
-        changes = expression_changes(baked.changes, face)
+        changes = expression_changes(baked.changes, face, baked.face_index)
         local_means = local_means + changes.get("means", np.float32(0))
         opacity_logits = opacity_logits + changes.get("opacity_logits", np.float32(0))
         if "color" in changes:
@@ -187,20 +187,50 @@ def _pose_mesh_bound(baked: MeshBound, face: Face) -> Gaussians:
     return _contiguous(means[0], quats[0], scales[0], sigmoid(opacity_logits), sh, T_world_local)
 
 
-def expression_changes(changes: ExpressionChanges, face: Face) -> dict[str, np.ndarray]:
+def expression_changes(
+    changes: ExpressionChanges, face: Face, face_index: Int32[np.ndarray, " n"]
+) -> dict[str, np.ndarray]:
     """Return the changes of the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None changes nothing."""
-    activations = _along(face, changes.rest, changes.directions, changes.seen)
+    table = activation_table(changes, face)
+    rows = None if changes.shares is None else face_index.astype(np.int64)
+    first = np.ascontiguousarray(table[:, : changes.basis_columns])
     added = {}
     for name in ("color", "opacity_logits", "means"):
         basis = getattr(changes, name)
         if basis is not None:
             added[name] = np.empty(basis.shape[:-1], np.float32)
-            _native.expression_change(np.ascontiguousarray(basis), activations[: changes.basis_columns], added[name])
+            _native.expression_change(np.ascontiguousarray(basis), first, rows, added[name])
     if changes.features is not None:
-        color, opacity_logits = feature_changes(changes.features, activations)
+        color, opacity_logits = feature_changes(changes.features, table, rows)
         added["color"] = added.get("color", np.float32(0)) + color
         added["opacity_logits"] = added.get("opacity_logits", np.float32(0)) + opacity_logits
     return added
+
+
+def activation_table(changes: ExpressionChanges, face: Face) -> Float32[np.ndarray, "_ a"]:
+    """The activations of each triangle, or one row for all if the face is one region; the same in training."""
+    regions = 1 if changes.shares is None else changes.shares.shape[1]
+    own = _along(face, changes.rest, changes.directions, changes.seen, regions).reshape(regions, -1)
+    table, head = own, changes.head
+    if head is not None:
+        motion, pose = np.empty(6, np.float32), np.empty(head.directions.shape[1], np.float32)
+        now = np.concatenate([face.head_rotation, face.head_translation]).astype(np.float32, copy=False)
+        _native.head_motion(head.rest, now, motion)
+        if len(pose):
+            _native.expression_activations(motion, np.zeros(6, np.float32), head.directions, head.seen, len(pose), pose)
+        together = np.concatenate([own, np.broadcast_to(pose, (regions, len(pose)))], axis=1)
+        table = np.ascontiguousarray(together[:, columns_of_activations(own.shape[1], len(pose))])
+    if changes.shares is None:
+        return table
+    out = np.empty((len(changes.shares), table.shape[1]), np.float32)
+    _native.blend_regions(changes.shares, table, out)
+    return out
+
+
+def columns_of_activations(own: int, head: int) -> list[int]:
+    """The order of a Gaussian's activations, out of `own` of the face, then `head` of the head's pose: one of each."""
+    places = [(2 * index, index) for index in range(own)] + [(2 * index + 1, own + index) for index in range(head)]
+    return [column for _, column in sorted(places)]
 
 
 def _along(
@@ -208,24 +238,29 @@ def _along(
     rest: Float32[np.ndarray, " i"],
     directions: Float32[np.ndarray, "i r"],
     seen: Float32[np.ndarray, "_ r"] | None = None,
+    regions: int = 1,
 ) -> Float32[np.ndarray, " r"]:
-    """(inputs - rest) directions, shortened to what training saw, by the same operation as in training."""
+    """(inputs - rest) directions, shortened in each region to what training saw, by the same operation as there."""
     inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
     activations = np.empty(directions.shape[1], np.float32)
     limits = np.empty((0, len(activations)), np.float32) if seen is None else seen
-    _native.expression_activations(inputs, rest, directions, limits, activations)
+    block = len(activations) // regions
+    _native.expression_activations(inputs, rest, directions, limits, block, activations)
     return activations
 
 
 def feature_changes(
-    features: FeatureChanges, activations: Float32[np.ndarray, " r"]
+    features: FeatureChanges, activations: Float32[np.ndarray, "_ a"], rows: Int64[np.ndarray, " n"] | None
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
-    """Changes of the first SH coefficient and of the raw opacity, by the same operation as in training."""
+    """Changes of the first SH coefficient and of the raw opacity, by the same operation as in training.
+
+    `rows` are the rows of the Gaussians' activations. None stands for the first.
+    """
     layers = zip(features.weights, features.biases, strict=True)
     arrays = [features.neutral, features.own, *(array for layer in layers for array in layer)]
     network = _native.FeatureNetwork(*(np.ascontiguousarray(array) for array in arrays))
     color, opacity_logits = (np.empty((len(features.neutral), *shape), np.float32) for shape in ((3,), ()))
-    bases = [_native.FeatureBases(np.ascontiguousarray(features.basis), activations, False)]
+    bases = _native.FeatureBases(np.ascontiguousarray(features.basis), activations, rows)
     _native.feature_network(network, bases, None, color, opacity_logits)
     return color, opacity_logits
 
@@ -302,7 +337,7 @@ def _run_native(network: AttributeNetwork, face: Face) -> tuple[np.ndarray, np.n
         arrays = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
         prepared = _networks[network] = _native.FeatureNetwork(*rows, *arrays)
     activations = _along(face, along.rest, along.directions)
-    bases = [_native.FeatureBases(np.ascontiguousarray(along.basis), activations, by_input=False)]
+    bases = _native.FeatureBases(np.ascontiguousarray(along.basis), activations[None], None)
     n, outputs = len(network.base), len(network.biases[-1])
     sh, opacity_logits = np.empty((n, outputs - 1), np.float32), np.empty(n, np.float32)
     _native.feature_network(prepared, bases, None, sh, opacity_logits)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien import _native
-from mien.adam import BETA1, BETA2, EPSILON, FactoredMoments
+from mien.adam import BETA1, BETA2, EPSILON, FactoredMoments, FactoredTerm
 from mien.arrays import unpacked
 from mien.avatar.avatar import ParameterGroup
 from mien.avatar.settings import Progress
@@ -31,8 +31,7 @@ class FactoredUpdate(NamedTuple):
     """The change of one tensor [n, k, f] in one step, by a sum of outer products."""
 
     values: Float[Tensor, "n k f"]
-    terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]
-    """Rows and columns of the gradient (`mien.adam.FactoredGradient`)."""
+    terms: Sequence[FactoredTerm]
     moments: Moments | FactoredMoments
     """Of Adam as published, with two running means of every number, or one second moment for all k."""
     rate: float
@@ -119,8 +118,9 @@ def _fit_core(tensors: Iterable[Tensor]) -> bool:
     return all(tensor.is_cpu and tensor.dtype is torch.float32 and tensor.is_contiguous() for tensor in tensors)
 
 
-def _whole(terms: Sequence[tuple[Float[Tensor, "n f"], Float[Tensor, " k"]]]) -> Float[Tensor, "n k f"]:
-    gradient = sum(rows[:, None, :] * columns[:, None] for rows, columns in terms)
+def _whole(terms: Sequence[FactoredTerm]) -> Float[Tensor, "n k f"]:
+    own = ((rows, columns if places is None else columns[places]) for rows, columns, places in terms)
+    gradient = sum(rows[:, None, :] * columns[..., None] for rows, columns in own)
     assert isinstance(gradient, Tensor)
     return gradient
 
@@ -137,15 +137,15 @@ def factored_update(update: FactoredUpdate) -> None:
     tensor of a step. Only numbers below 1.2e-38 differ: they become 0, because running means that fade would be slow.
     """
     values, terms, moments, rate = update
-    terms = [(rows, columns.detach()) for rows, columns in terms]
+    terms = [FactoredTerm(rows, torch.atleast_2d(columns.detach()), places) for rows, columns, places in terms]
     factored = isinstance(moments, FactoredMoments)
     state = (moments.second, moments.weights) if factored else (moments.first, moments.second, moments.step)
     arrays = (values.detach(), *state)
-    if _fit_core((*arrays, *(tensor for term in terms for tensor in term))):
+    if _fit_core((*arrays, *(tensor for term in terms for tensor in (term.rows, term.columns)))):
         native_values, *native_state = unpacked(*arrays)
-        rows, columns = (list(unpacked(*side)) for side in zip(*terms, strict=True))
+        factors = (list(unpacked(*side)) for side in zip(*terms, strict=True))
         apply: Any = _native.factored_update if factored else _native.factored_adam_update
-        apply(native_values, rows, columns, *native_state, rate)
+        apply(native_values, *factors, *native_state, rate)
     elif factored:
         factored_update_reference(update)
     else:

@@ -5,6 +5,7 @@ matters. Lengths and scales in the store are in units of the triangle's own scal
 Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -70,7 +71,7 @@ class GaussianAvatars(Avatar):
             trained |= feature_tensors(trained["means"], self._activation_count, config.appearance_features)
             self.appearance = FeatureAppearance(like[:, 0], config.appearance_features)
         if self._changes:
-            self.activations = ExpressionActivations(face, self.subject, self._activation_count)
+            self.activations = ExpressionActivations(face_model, face, self.subject, self._activation_count)
         self.store = GaussianStore(trained, {"face_index": torch.arange(n, device=like.device)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
@@ -86,10 +87,10 @@ class GaussianAvatars(Avatar):
             each = [self._pose_with_changes(face[timestep], sh, in_head) for timestep in range(len(face))]
             aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in each[0].aux}
             return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
-        (activations,) = self.activations(face)
+        activations = self.activations(face)
         # Bases take the first activations, which are those of the largest spread.
-        first = activations[: self.config.expression_rank]
-        changes = {name: expression_change(self.store[name], first) for name in self._basis_shapes()}
+        first, rows = activations[:, : self.config.expression_rank], self.store["face_index"]
+        changes = {name: expression_change(self.store[name], first, rows) for name in self._basis_shapes()}
         local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
         if self.appearance is not None:
             changes["feature_color"], changes["feature_opacity"] = self.appearance(self.store, activations)
@@ -180,11 +181,18 @@ class GaussianAvatars(Avatar):
         if not self._changes:
             return None
         features = None if self.appearance is None else self.appearance.bake(self.store)
-        fixed = (as_array(getattr(self.activations, name)) for name in ("rest", "directions", "seen"))
-        bases = (as_array(self.store[name]) if name in self._basis_shapes() else None for name in BASES)
+        color, opacity_logits, means = (
+            as_array(self.store[name]) if name in self._basis_shapes() else None for name in BASES
+        )
         rank = self.config.expression_rank
-        basis_columns = rank if self._basis_shapes() and rank < self._activation_count else None
-        return ExpressionChanges(*fixed, *bases, features=features, basis_columns=basis_columns)
+        return replace(
+            self.activations.record(),
+            color=color,
+            opacity_logits=opacity_logits,
+            means=means,
+            features=features,
+            basis_columns=rank if self._basis_shapes() and rank < self._activation_count else None,
+        )
 
     @property
     def _sh_frame(self) -> Literal["world", "head"]:

@@ -86,16 +86,16 @@ class FeatureAppearance(nn.Module):
         self._gradient = FactoredGradient()
 
     def forward(
-        self, store: GaussianStore, activations: Float[Tensor, " r"]
+        self, store: GaussianStore, activations: Float[Tensor, "f a"]
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-        """Changes of the first SH coefficients and of the raw opacities. Differentiable; native on a CPU.
+        """Changes of the first SH coefficients and of the raw opacities, by the activations of each triangle.
 
-        The activations get no gradient, because it takes another pass over all features. For linear changes, it made no
-        difference (log, 11-22); for features alone, it was not measured.
+        Differentiable in all but the activations; native on a CPU. Poses are tuned without what changes with them: for
+        linear changes, their gradient made no difference (log, 11-22).
         """
-        bases, neutral = store["feature_bases"], store["neutral_features"]
+        bases, neutral, rows = store["feature_bases"], store["neutral_features"], store["face_index"]
         own = neutral.new_zeros(len(neutral), 0)
-        return feature_network(bases, activations.detach(), neutral, own, self.layers(), self._gradient)
+        return feature_network(bases, activations, rows, neutral, own, self.layers(), self._gradient)
 
     def parameter_groups(self, store: GaussianStore) -> list[ParameterGroup]:
         """The groups of the features and of the network."""

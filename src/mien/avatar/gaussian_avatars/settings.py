@@ -44,16 +44,17 @@ class GaussianAvatarsConfig(MethodConfig):
     means_times_extent: bool = False
     """Whether this rate is multiplied by the extent of the cameras in metres, as in the paper."""
     expression_rank: Annotated[int, Range(0, 8)] = 4
-    """Number of activations of the face with which each Gaussian changes, for what the mesh cannot say, such as
-    wrinkles. 0 is the paper's method."""
+    """Number of activations with which each Gaussian moves, for what the mesh cannot say, such as wrinkles. 0 is the
+    paper's method."""
     expression_changes: tuple[ChangeKind, ...] = ("offset",)
     """Attributes that change linearly with these activations: a Gaussian's colour, opacity, or place (offset)."""
     expression_weight: Annotated[float, NOT_NEGATIVE] = 3.0
     """Weight of the mean squared changes with the expression, which holds back what pictures do not need."""
     appearance: Literal["static", "features"] = "features"
     """Whether colour and opacity stay as they are, as in the paper, or also change with features, as in HeadGaS."""
-    appearance_directions: Annotated[int, Range(1, 64), NotBelow("expression_rank")] = 12
-    """Number of activations that blend the features, of which those of `expression_rank` are the first."""
+    appearance_directions: Annotated[int, Range(1, 64), NotBelow("expression_rank")] = 11
+    """Number of activations that blend a Gaussian's features: of the motion of its region of the face, and of the
+    head's pose, in turn. Those of `expression_rank` are the first."""
     appearance_features: Annotated[int, Range(1, 256)] = 16
     """Number of features of each Gaussian."""
     position_weight: Annotated[float, NOT_NEGATIVE] = 0.01

@@ -211,7 +211,7 @@ class HeadGas(Avatar):
     ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
         """The outputs of a network at one timestep: all but the last, and the last."""
         bases, neutral = self.store["bases"], self.store["neutral_features"]
-        return feature_network(bases, inputs, neutral, encoding, layers, self.bases_gradient)
+        return feature_network(bases, inputs, None, neutral, encoding, layers, self.bases_gradient)
 
     def output_shares(self, progress: Progress) -> Float[Tensor, " o"]:
         """Factors of colours and opacity. Of higher degrees of colours, a share, and 0 before they begin."""

@@ -116,7 +116,7 @@ def _average(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Change
     for e in inputs:
         weights, rest = averaging_weights(e)
         neutral = rest * avatar.store["neutral_features"]
-        values = shares * blended_features(avatar.store["bases"], weights, neutral, avatar.bases_gradient)
+        values = shares * blended_features(avatar.store["bases"], weights, None, neutral, avatar.bases_gradient)
         yield Changes(values[:, :-1], values[:, -1] + start_logit().to(values))
 
 

@@ -1,25 +1,33 @@
 """Changes of Gaussians with the expression, of low rank: what a mesh cannot say, such as wrinkles and pressed lips.
 
-A few activations describe the whole face (`ExpressionActivations`). Each Gaussian has a basis, whose product with the
-activations is added to one of its raw values (`expression_change`). Not part of any of the three papers.
+A few activations describe the motion of each region of the face, and a few the head's pose (`ExpressionActivations`).
+Each Gaussian has a basis, whose product with the activations of its triangle is added to one of its raw values
+(`expression_change`). Not part of any of the three papers.
 """
 
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import native, recycled, unpacked
+from mien.arrays import is_native, native, recycled, unpacked
+from mien.avatar.ops.regions import region_shares, vertex_motions
+from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.rotation import matrix_from_axis_angle
+from mien.runtime.baked import ExpressionChanges, HeadActivations
+from mien.runtime.posing import Face, activation_table, columns_of_activations
 
 _EXPRESSIONS_BEYOND = 1.2
 """How far activations may go, relative to those of the training frames. 98 % of the held-out frames of wojtek go up to
 1.14, of d3 up to 1.06, of other clips up to 1.21. With 1, wojtek's held-out frames lose 0.03 dB (11-27)."""
 _EXPRESSIONS_LEAST_DEVIATION = 0.1  # smallest deviation that is scaled to 1, relative to that of the first direction
 
+_SHIFT = 5.0
+"""Weight of a shift of the head by a metre, relative to a turn with a sine of 1."""
 MARGIN = 0.1
 """How far activations can get beyond what training saw along them, as a share of it."""
 _LEAST_SEEN = 1e-6
@@ -27,75 +35,96 @@ _LEAST_SEEN = 1e-6
 
 
 class ExpressionActivations(nn.Module):
-    """r numbers that describe an expression: how far it is from the person at rest, along r principal directions.
+    """How far a face is from the person at rest: for each triangle, a few numbers about its region and the head's pose.
 
-    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
-    directions are scaled so that the activations of the given timesteps have a deviation of 1 or less. They are fixed:
-    training changes only the bases of the Gaussians.
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. A
+    region's activations go along the principal directions of what moves its own vertices, so that a brow does not
+    change with the mouth. Coefficients of a tracked clip also follow the turns of the head: without activations of its
+    pose, Gaussians learn light and misfit by expressions. Both are scaled so that those of the given timesteps have a
+    deviation of 1 or less. They are fixed: training changes only the bases of the Gaussians.
     """
 
     rest: Tensor
     directions: Tensor
     seen: Tensor
+    head_rest: Tensor
+    head_directions: Tensor
+    head_seen: Tensor
+    shares: Tensor
 
-    def __init__(self, face: FaceParams, neutral: FaceParams, rank: int):
-        """Take the directions, and the range of the activations, from the timesteps of `face`.
+    def __init__(self, face_model: FaceModel, face: FaceParams, neutral: FaceParams, count: int):
+        """Take `count` numbers for each triangle, a region's and the pose's in turn.
 
-        Directions that the timesteps do not have are 0.
+        The directions, and the range of the activations, are those of the timesteps of `face`. Directions that the
+        timesteps do not have are 0.
         """
         super().__init__()
+        shares, motions = region_shares(face_model, neutral), vertex_motions(face_model, neutral)
         rest = expression_inputs(neutral)[0]
-        offsets = expression_inputs(face) - rest
-        directions = principal_directions(offsets, rank)
-        seen = _EXPRESSIONS_BEYOND * outermost(offsets @ directions)
-        for name, value in (("rest", rest), ("directions", directions), ("seen", seen)):
-            self.register_buffer(name, value.detach().clone())
+        offsets, own = expression_inputs(face) - rest, (count + 1) // 2
+        parts = [principal_directions(offsets, own, _weighted_root(motions, share)) for share in shares.unbind(1)]
+        seen = [_EXPRESSIONS_BEYOND * outermost(offsets @ part) for part in parts]
+        moved = head_motion(neutral, face)
+        pose = principal_directions(moved, count // 2, torch.diag(moved.new_tensor([1.0] * 3 + [_SHIFT] * 3)))
+        values = {
+            "rest": rest,
+            "directions": torch.cat(parts, 1),
+            "seen": torch.block_diag(*seen),
+            "head_rest": torch.cat([neutral.head_rotation[0], neutral.head_translation[0]]),
+            "head_directions": pose,
+            "head_seen": _EXPRESSIONS_BEYOND * outermost(moved @ pose),
+            "shares": shares[face_model.faces].mean(1),
+        }
+        for name, value in values.items():
+            self.register_buffer(name, value.detach().clone().contiguous())
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
         # The number of rows comes from the frames, which are not there when an avatar is loaded.
-        seen = state_dict.get(prefix + "seen")
-        if seen is not None and seen.shape[1:] == self.seen.shape[1:]:
-            self.seen = self.seen.new_empty(seen.shape)
+        for name in ("seen", "head_seen"):
+            seen = state_dict.get(prefix + name)
+            if seen is not None and seen.shape[1:] == getattr(self, name).shape[1:]:
+                setattr(self, name, getattr(self, name).new_empty(seen.shape))
         super()._load_from_state_dict(state_dict, prefix, *others)
 
-    def forward(self, face: FaceParams) -> Float[Tensor, "b r"]:
-        """The activations of some timesteps. Differentiable in `face`; native for float32 on a CPU."""
-        return _activations(expression_inputs(face), self.rest, self.directions, self.seen)
+    @torch.no_grad()
+    def forward(self, face: FaceParams) -> Float[Tensor, "f a"]:
+        """The activations of each triangle at one timestep. They have no gradient; native for float32 on a CPU."""
+        parts = [part.detach() for part in (face.expression, face.joints, face.head_rotation, face.head_translation)]
+        if not is_native(self.rest, *parts):
+            return self.reference(face)
+        return torch.from_numpy(activation_table(self.record(), Face(*(part[0].numpy() for part in parts))))
+
+    def reference(self, face: FaceParams) -> Float[Tensor, "f a"]:
+        """`forward` in plain PyTorch, any dtype and device."""
+        regions = self.shares.shape[1]
+        block = self.directions.shape[1] // regions
+        found = ((expression_inputs(face)[0] - self.rest) @ self.directions).view(regions, block)
+        limits = self.seen.view(len(self.seen), regions, block).unbind(1)
+        own = torch.stack([within_seen(one[None], limit)[0] for one, limit in zip(found, limits, strict=True)])
+        at_rest = FaceParams(
+            face.identity, face.expression, face.joints, self.head_rest[None, :3], self.head_rest[None, 3:]
+        )
+        pose = within_seen(head_motion(at_rest, face) @ self.head_directions, self.head_seen)
+        table = torch.cat([own, pose.expand(regions, -1)], 1)
+        return self.shares @ table[:, columns_of_activations(block, pose.shape[1])]
+
+    def record(self) -> ExpressionChanges:
+        """The activations as a runtime takes them, without anything that they change."""
+        arrays = {name: buffer.detach().cpu().numpy() for name, buffer in self.named_buffers()}
+        head = HeadActivations(arrays["head_rest"], arrays["head_directions"], arrays["head_seen"])
+        return ExpressionChanges(
+            arrays["rest"], arrays["directions"], arrays["seen"], shares=arrays["shares"], head=head
+        )
 
 
-def activations_reference(
-    inputs: Float[Tensor, "b i"],
-    rest: Float[Tensor, " i"],
-    directions: Float[Tensor, "i r"],
-    seen: Float[Tensor, "s r"],
-) -> Float[Tensor, "b r"]:
-    """(inputs - rest) directions, shortened (`within_seen`), in plain PyTorch, any dtype and device."""
-    return within_seen((inputs - rest) @ directions, seen)
-
-
-@native(activations_reference)
-def _activations(*arguments: Tensor) -> Tensor:
-    return _Activations.apply(*arguments)  # pyright: ignore[reportReturnType]
-
-
-class _Activations(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, inputs: Tensor, *fixed: Tensor) -> Tensor:
-        rows, *others = [tensor.detach().contiguous() for tensor in (inputs, *fixed)]
-        out = torch.empty(len(rows), others[1].shape[1])
-        for row, activations in zip(rows, out, strict=True):
-            _native.expression_activations(*unpacked(row, *others, activations))
-        ctx.save_for_backward(rows, *others)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, *fixed = ctx.saved_tensors
-        by_inputs = torch.empty_like(inputs)
-        for row, by_row, out in zip(inputs, gradient.contiguous(), by_inputs, strict=True):
-            _native.expression_activations_backward(*unpacked(row, *fixed, by_row, out))
-        return by_inputs, None, None, None
+def head_motion(neutral: FaceParams, face: FaceParams) -> Float[Tensor, "b 6"]:
+    """How the head moved from its pose at rest: sines of turns about its own axes there, then its shift, in metres."""
+    at_rest = matrix_from_axis_angle(neutral.head_rotation[0])
+    turn = at_rest.T @ matrix_from_axis_angle(face.head_rotation)
+    sines = torch.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1
+    )
+    return torch.cat([sines / 2, (face.head_translation - neutral.head_translation[0]) @ at_rest], 1)
 
 
 def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
@@ -103,9 +132,24 @@ def expression_inputs(face: FaceParams) -> Float[Tensor, "b i"]:
     return torch.cat([face.expression, face.joints.flatten(1)], dim=-1)
 
 
-def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> Float[Tensor, "i r"]:
-    """Directions of the largest spread, strongest first. Along each, the timesteps have a deviation of 1 or less."""
-    exact = offsets.detach().double().cpu()
+def _weighted_root(motions: Float[Tensor, "i v 3"], share: Float[Tensor, " v"]) -> Float[Tensor, "i i"]:
+    """The root of the products of the inputs' motions: the square of an input through it is that of what it moves."""
+    moved = (motions.double().cpu() * share.double().cpu().sqrt()[:, None]).flatten(1)
+    values, vectors = torch.linalg.eigh(moved @ moved.T)
+    return vectors @ torch.diag(values.clamp_min(0).sqrt()) @ vectors.T
+
+
+def principal_directions(
+    offsets: Float[Tensor, "t i"], rank: int, root: Float[Tensor, "i i"] | None = None
+) -> Float[Tensor, "i r"]:
+    """Directions of the largest spread, strongest first. Along each, the timesteps have a deviation of 1 or less.
+
+    With `root`, the spread is that of the offsets times it, which says what each of them does.
+    """
+    if rank == 0:
+        return offsets.new_zeros(offsets.shape[1], 0)
+    exact, scale = offsets.detach().double().cpu(), None if root is None else root.double().cpu()
+    exact = exact if scale is None else exact @ scale
     centered = exact - exact.mean(0)
     strengths, vectors = torch.linalg.eigh(centered.T @ centered / len(centered))
     count = min(rank, len(strengths))
@@ -115,7 +159,7 @@ def principal_directions(offsets: Float[Tensor, "t i"], rank: int) -> Float[Tens
     scales = deviations.clamp_min(max(_EXPRESSIONS_LEAST_DEVIATION * float(deviations[0]), 1e-6))
     directions = exact.new_zeros(len(vectors), rank)
     directions[:, :count] = vectors * largest.sign() * usable / scales
-    return directions.to(offsets)
+    return (directions if scale is None else scale @ directions).to(offsets)
 
 
 def outermost(activations: Float[Tensor, "t r"]) -> Float[Tensor, "s r"]:
@@ -142,32 +186,39 @@ def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s r"]) -> Flo
     return values * torch.where(over > 0, shortened, 1.0)
 
 
-def expression_change_reference(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
+def expression_change_reference(
+    basis: Float[Tensor, "n ... r"], activations: Float[Tensor, "g r"], rows: Int[Tensor, " n"] | None
+) -> Float[Tensor, "n ..."]:
     """`expression_change` in plain PyTorch, any dtype and device."""
-    return (basis.flatten(0, -2) @ activations).view(basis.shape[:-1])
+    own = activations[0] if rows is None else activations[rows].view(-1, *[1] * (basis.ndim - 2), basis.shape[-1])
+    return (basis * own).sum(-1)
 
 
 @native(expression_change_reference)
-def expression_change(basis: Float[Tensor, "*s r"], activations: Float[Tensor, " r"]) -> Float[Tensor, "*s"]:
-    """The sum of a basis' columns, weighted by 1 to 8 activations. Differentiable; native for float32 on a CPU."""
-    return _Change.apply(basis, activations)
+def expression_change(
+    basis: Float[Tensor, "n ... r"], activations: Float[Tensor, "g r"], rows: Int[Tensor, " n"] | None
+) -> Float[Tensor, "n ..."]:
+    """The sum of a basis' columns, weighted by a Gaussian's row of activations, or the first of them without rows.
+
+    Differentiable in the basis; native for float32 on a CPU.
+    """
+    return _Change.apply(basis, activations, rows)
 
 
 class _Change(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, basis: Tensor, activations: Tensor) -> Tensor:
+    def forward(ctx: Any, basis: Tensor, activations: Tensor, rows: Tensor | None) -> Tensor:
         basis, activations = basis.detach().contiguous(), activations.detach().contiguous()
         out = torch.empty(basis.shape[:-1])
-        _native.expression_change(*unpacked(basis, activations, out))
-        ctx.save_for_backward(basis, activations)
+        _native.expression_change(*unpacked(basis, activations, rows, out))
+        ctx.shape, ctx.rows = basis.shape, rows
+        ctx.save_for_backward(activations)
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        basis, activations = ctx.saved_tensors
-        by_basis, by_activations = recycled(*basis.shape), torch.empty_like(activations)
-        _native.expression_change_backward(
-            *unpacked(basis, activations, gradient.contiguous(), by_basis, by_activations)
-        )
-        return by_basis, by_activations
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        (activations,) = ctx.saved_tensors
+        by_basis = recycled(*ctx.shape)
+        _native.expression_change_backward(*unpacked(activations, ctx.rows, gradient.contiguous(), by_basis))
+        return by_basis, None, None

@@ -11,12 +11,12 @@ The bases are by far the largest tensor of an avatar. Their gradient by F_k is e
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.adam import FactoredGradient
+from mien.adam import FactoredGradient, FactoredTerm
 from mien.arrays import native, recycled, unpacked
 
 SLOPE = 0.01
@@ -35,35 +35,39 @@ class Layers(NamedTuple):
 
 
 def _plain_network(
-    bases: Tensor, inputs: Tensor, neutral: Tensor, own: Tensor, layers: Layers, gradient: FactoredGradient
-) -> tuple[Tensor, Tensor]:
-    return network_outputs(blended_features(bases, inputs, neutral, gradient), own, layers)
+    bases: Tensor, inputs: Tensor, rows: Tensor | None, neutral: Tensor, own: Tensor, layers: Layers,
+    gradient: FactoredGradient,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    return network_outputs(blended_features(bases, inputs, rows, neutral, gradient), own, layers)
 
 
 @native(_plain_network)
 def feature_network(
     bases: Float[Tensor, "n k f"],
-    inputs: Float[Tensor, " k"],
+    inputs: Float[Tensor, "*g k"],
+    rows: Int[Tensor, " n"] | None,
     neutral: Float[Tensor, "n f"],
     own: Float[Tensor, "n x"],
     layers: Layers,
     gradient: FactoredGradient,
 ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
-    """All outputs but the last, and the last. Differentiable in everything.
+    """All outputs but the last, and the last. Differentiable in everything but inputs with rows.
 
-    The gradient of the bases goes to `gradient`. `own` are numbers of each Gaussian beside its features.
+    With `rows`, `inputs` is a table [g, k], and each Gaussian takes its row; without, all take the same inputs [k]. The
+    gradient of the bases goes to `gradient`. `own` are numbers of each Gaussian beside its features.
     """
-    return _Network.apply(gradient, bases, inputs, neutral, own, *layers)
+    return _Network.apply(gradient, rows, bases, inputs, neutral, own, *layers)
 
 
 def blended_features(
     bases: Float[Tensor, "n k f"],
-    inputs: Float[Tensor, " k"],
+    inputs: Float[Tensor, "*g k"],
+    rows: Int[Tensor, " n"] | None,
     neutral: Float[Tensor, "n f"],
     gradient: FactoredGradient,
 ) -> Float[Tensor, "n f"]:
     """The features without a network. The gradient of the bases goes to `gradient`, as in `feature_network`."""
-    return _Blend.apply(gradient, bases, inputs, neutral)
+    return _Blend.apply(gradient, rows, bases, inputs, neutral)
 
 
 def network_outputs(
@@ -77,24 +81,28 @@ def network_outputs(
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, gradient: FactoredGradient, bases: Tensor, inputs: Tensor, neutral: Tensor) -> Tensor:
-        ctx.gradient = gradient
+    def forward(
+        ctx: Any, gradient: FactoredGradient, rows: Tensor | None, bases: Tensor, inputs: Tensor, neutral: Tensor
+    ) -> Tensor:
+        ctx.gradient, ctx.rows = gradient, rows
         ctx.save_for_backward(bases, inputs)
+        if rows is not None:
+            return neutral + torch.einsum("nkf,nk->nf", bases, inputs[rows])
         return neutral + torch.einsum("nkf,k->nf", bases, inputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_features: Tensor) -> tuple[Tensor | None, ...]:
         bases, inputs = ctx.saved_tensors
-        if ctx.needs_input_grad[1]:
-            ctx.gradient.terms.append((by_features, inputs))
-        by_inputs = torch.einsum("nkf,nf->k", bases, by_features) if ctx.needs_input_grad[2] else None
-        return None, None, by_inputs, by_features
+        if ctx.needs_input_grad[2]:
+            ctx.gradient.terms.append(FactoredTerm(by_features, inputs, ctx.rows))
+        by_inputs = torch.einsum("nkf,nf->k", bases, by_features) if ctx.needs_input_grad[3] else None
+        return None, None, None, by_inputs, by_features
 
 
 class _Network(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, gradient: FactoredGradient, *arguments: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, gradient: FactoredGradient, rows: Tensor | None, *arguments: Tensor) -> tuple[Tensor, Tensor]:
         bases, inputs, neutral, *rest = (tensor.detach().contiguous() for tensor in arguments)
         n, outputs = len(neutral), len(rest[-1])
         last, others = torch.empty(n), recycled(n, outputs - 1)
@@ -103,11 +111,11 @@ class _Network(torch.autograd.Function):
             kept = (recycled(*neutral.shape), recycled(n, -(-len(rest[2]) // _LANES) * _LANES))
         _native.feature_network(
             _native.FeatureNetwork(*unpacked(neutral, *rest)),
-            [_native.FeatureBases(*unpacked(bases, inputs), by_input=False)],
+            _native.FeatureBases(*unpacked(bases, torch.atleast_2d(inputs), rows)),
             _native.FeatureKept(*unpacked(*kept)) if kept else None,
             *unpacked(others, last),
         )
-        ctx.gradient, ctx.neutral = gradient, arguments[2] if arguments[2].is_leaf else None
+        ctx.gradient, ctx.rows, ctx.neutral = gradient, rows, arguments[2] if arguments[2].is_leaf else None
         ctx.save_for_backward(bases, inputs, neutral, *rest, *kept)
         return others, last
 
@@ -116,22 +124,22 @@ class _Network(torch.autograd.Function):
     def backward(ctx: Any, by_others: Tensor, by_last: Tensor) -> tuple[Tensor | None, ...]:
         bases, inputs, neutral, own, *layers = ctx.saved_tensors[:8]
         by_features = recycled(*neutral.shape)
-        by_inputs = torch.empty(len(inputs) if ctx.needs_input_grad[2] else 0)
-        by_own = torch.empty_like(own) if ctx.needs_input_grad[4] else None
+        by_inputs = torch.empty(len(inputs) if ctx.needs_input_grad[3] else 0)
+        by_own = torch.empty_like(own) if ctx.needs_input_grad[5] else None
         by_layers = [torch.empty_like(tensor) for tensor in layers]
         _native.feature_network_backward(
             _native.FeatureNetwork(*unpacked(neutral, own, *layers)),
-            [_native.FeatureBases(*unpacked(bases, inputs), by_input=False)],
+            _native.FeatureBases(*unpacked(bases, torch.atleast_2d(inputs), ctx.rows)),
             _native.FeatureKept(*unpacked(*ctx.saved_tensors[8:])),
             _native.FeatureGradients(
                 *unpacked(by_others.contiguous(), by_last.contiguous(), by_features, *by_layers, by_inputs),
                 *unpacked(torch.empty(0, 0) if by_own is None else by_own),
             ),
         )
-        if ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[2]:
             if ctx.neutral is not None and ctx.neutral.grad is not None:
                 # It may share the memory of an earlier term, and autograd adds to it in place.
                 ctx.neutral.grad = ctx.neutral.grad.clone()
             # Autograd copies gradients that somebody else holds. It does not know of a second tensor in their memory.
-            ctx.gradient.terms.append((by_features.detach(), inputs))
-        return None, None, by_inputs if len(by_inputs) else None, by_features, by_own, *by_layers
+            ctx.gradient.terms.append(FactoredTerm(by_features.detach(), inputs, ctx.rows))
+        return None, None, None, by_inputs if len(by_inputs) else None, by_features, by_own, *by_layers

@@ -101,7 +101,7 @@ class Unseen:
         gradients = [own for own in (store[name].grad for name in store.trained) if own is not None]
         gradients += [own for own in (rendering.means2d_offset.grad for rendering in renderings) if own is not None]
         factored = [own for group in avatar.parameter_groups() for own in group.factored.values()]
-        gradients += [rows for own in factored for rows, _ in own.terms]
+        gradients += [term.rows for own in factored for term in own.terms]
         # The second axis of a triangle's frame is its normal.
         places = store["means"].grad
         strong = None if places is None else softshrink(places[:, 1], _FILL_CONTRADICTION)

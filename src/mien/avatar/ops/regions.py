@@ -1,0 +1,65 @@
+"""Regions of a face, and how their vertices move, so that Gaussians change with the motion around them."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+
+_STEP = 0.1
+"""Change of an input for differences, in its unit."""
+_BROW, _BROW_BLEND, _EYE, _EYE_BLEND = 0.55, 0.4, -0.75, 0.6
+"""Borders below brows and eyes, and the widths over which regions blend there: heights above the eyes' centres, in
+units of the distance from there to the brows."""
+_MIDDLE_BLEND = 0.25  # width over which left and right blend, in units of the distance between the eyes' outer corners
+
+
+def region_shares(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, "v g"]:
+    """Shares of each region in the vertices at rest: brows and eyes, left and right, and the lower face. The sum is 1.
+
+    Regions go on over the whole head: hair belongs to the brows, the neck to the lower face. A model without the
+    landmarks `ibug68` is one region.
+    """
+    vertices = face_model.head_vertices(subject)[0]
+    if "ibug68" not in face_model.landmarks:
+        return torch.ones_like(vertices[:, :1])
+    marks = face_model.landmark_positions(vertices, "ibug68")
+    eyes = marks[36:48, 1].mean()
+    gap = marks[17:27, 1].mean() - eyes
+    brows = _smooth_step(vertices[:, 1], eyes + _BROW * gap, _BROW_BLEND * gap)
+    upper = _smooth_step(vertices[:, 1], eyes + _EYE * gap, _EYE_BLEND * gap)
+    width = _MIDDLE_BLEND * (marks[45, 0] - marks[36, 0]).abs()
+    left = _smooth_step(vertices[:, 0], marks[27:31, 0].mean(), width)
+    sides = torch.stack([left, 1 - left], 1)
+    brow, eye = upper * brows, upper * (1 - brows)
+    return torch.cat([brow[:, None] * sides, eye[:, None] * sides, 1 - upper[:, None]], 1)
+
+
+@torch.no_grad()
+def vertex_motions(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, "i v 3"]:
+    """How the vertices move with each input of the face, in metres per unit, around the person at rest.
+
+    The neck counts as still: it turns all below the chin, as the head's pose does.
+    """
+    e, j = subject.expression.shape[1], subject.joints.shape[1]
+    i = e + 3 * j
+    many = subject[[0] * i]
+
+    def at(change: Float[Tensor, "i i"]) -> Float[Tensor, "i v 3"]:
+        joints = many.joints + change[:, e:].reshape(i, j, 3)
+        return face_model.head_vertices(replace(many, expression=many.expression + change[:, :e], joints=joints))
+
+    steps = _STEP * torch.eye(i).to(subject.expression)
+    motions = (at(steps) - at(-steps)) / (2 * _STEP)
+    for joint, name in enumerate(face_model.free_joint_names):
+        if name == "neck":
+            motions[e + 3 * joint : e + 3 * joint + 3] = 0
+    return motions
+
+
+def _smooth_step(values: Tensor, middle: Tensor, width: Tensor) -> Tensor:
+    t = ((values - middle) / width + 0.5).clamp(0, 1)
+    return t * t * (3 - 2 * t)
