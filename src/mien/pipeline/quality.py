@@ -27,7 +27,13 @@ from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
 from mien.lab.benchmarking.quality import QualityRow, markdown_table, tracking_errors
-from mien.lab.benchmarking.unfilmed import PosedPictures, glasses_masks, score_unfilmed, unfilmed_table
+from mien.lab.benchmarking.unfilmed import (
+    PosedPictures,
+    as_avatar_has_it,
+    glasses_masks,
+    score_unfilmed,
+    unfilmed_table,
+)
 from mien.lab.benchmarking.unseen_views import (
     Figures,
     SidePictures,
@@ -150,9 +156,9 @@ def _capture(reference: ReferenceCapture, drawn: Path, workspace: Workspace) -> 
 
 
 def run_unfilmed(reference: ReferenceCapture, out: Path, method: str, steps: int) -> str:
-    """Train on the true tracking of talk, and of all clips, and score both on faces that the talk does not show.
+    """Train on the true tracking of talk, and of all clips, and on talk as tracked, and score other faces.
 
-    Returns a table. Writes OUT/NAME-true/runs/RUN/unfilmed.json, and a sheet beside it.
+    Returns a table. Writes unfilmed.json and a sheet into each run's folder, in OUT/NAME-true and OUT/NAME-tracked.
     """
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     say(f"== {reference.name}: {reference.description}")
@@ -163,14 +169,20 @@ def run_unfilmed(reference: ReferenceCapture, out: Path, method: str, steps: int
     scene = reference.scenes()[-1]
     capture, truth = read_capture(drawn / FACES / "capture"), read_truth(drawn / FACES / "truth")
     pictures = PosedPictures(tuple(posed_faces(scene.model)), capture.images, truth, glasses_masks(scene))
-    figures = {}
-    for run, trained in ((f"{method}-{steps}", [TALK]), (f"{method}-{steps}-everything", names)):
-        run_training_stage(true, trained, run, _PRESET.config(method), settings)
-        folder = true.run_dir(run)
-        figures[run], sheet = score_unfilmed(load_avatar(folder), pictures, ScoreSettings(perceptual_frames=0))
+    tracked, run, figures = Workspace(out / f"{reference.name}-tracked"), f"{method}-{steps}", {}
+    _copy_capture(workspace.sequence_dir(TALK) / "capture", tracked.sequence_dir(TALK))
+    run_tracking_stage(tracked, "anny", TrackingSettings(), overlay="none")
+    run_alignment_stage(tracked, [TALK], AlignmentSettings(), settings, keep=True)
+    runs = (("talk", true, [TALK], ""), ("everything", true, names, "-everything"), ("as tracked", tracked, [TALK], ""))
+    for kind, of, filmed, suffix in runs:
+        folder = of.run_dir(f"{run}{suffix}")
+        run_training_stage(of, filmed, folder.name, _PRESET.config(method), settings)
+        avatar = load_avatar(folder)
+        own = as_avatar_has_it(avatar, pictures) if of is tracked else pictures
+        figures[kind], sheet = score_unfilmed(avatar, own, ScoreSettings(perceptual_frames=0))
         write_png(folder / "unfilmed.png", sheet)
-        write_json(folder / "unfilmed.json", "mien.unfilmed", 1, {"key": key, "regions": figures[run]})
-    say(f"Look at unfilmed.png in {', '.join(str(true.run_dir(run)) for run in figures)}")
+        write_json(folder / "unfilmed.json", "mien.unfilmed", 1, {"key": key, "regions": figures[kind]})
+    say(f"Look at unfilmed.png in the runs of {true.root} and {tracked.root}")
     return unfilmed_table(reference.name, key, figures)
 
 

@@ -1,12 +1,12 @@
 """The protocol `unfilmed`: faces that a clip does not show, against true pictures of the person, by region.
 
 An avatar is trained on the true tracking, so that coefficients mean the same in both, and what is measured is the
-avatar alone. It is scored in front and at 20 degrees, once after a clip of talk and once after clips that show
-everything, which is as good as a method gets.
+avatar alone: once after a clip of talk, and once after clips that show everything, which is as good as a method gets. A
+third one is trained on the talk as mien tracks it, as people's avatars are. All are scored in front and at 20 degrees.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
@@ -29,6 +29,7 @@ from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import track_progress
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh
+from mien.rotation import matrix_from_axis_angle
 
 REGIONS = ("glasses", "teeth", "mouth", "lids", "brows", "cheeks", "rest")
 """The regions of a face. A pixel belongs to the first that it is in."""
@@ -65,6 +66,32 @@ class PosedPictures:
     def target(self, timestep: int, camera: int) -> Float[Tensor, "h w 3"]:
         """A true picture."""
         return torch.from_numpy(np.array(self.images[timestep, camera])).float() / 255
+
+
+@torch.no_grad()
+def as_avatar_has_it(avatar: Avatar, pictures: PosedPictures) -> PosedPictures:
+    """The pictures with the faces of an avatar that was trained on a tracking, and with cameras in its world.
+
+    A face has the avatar's coefficients at rest and what the true one adds to its own. The head stays where the avatar
+    has it at rest, and cameras see it as its landmarks at rest fit the true ones best in the front picture.
+    """
+    true, model, rest = pictures.truth.tracking, avatar.face_model, avatar.subject
+    front, marks = true.cameras[0], model.landmark_positions(model.head_vertices(rest)[0], "mediapipe")
+    turn, place = cv2.solvePnP(
+        marks.double().numpy(), pictures.truth.landmarks[0, 0].astype(np.float64), front.K.double().numpy(), None,
+    )[1:]  # fmt: skip
+    seen = torch.eye(4, dtype=torch.float64)  # of the head in the front camera
+    seen[:3, :3], seen[:3, 3] = matrix_from_axis_angle(torch.from_numpy(turn[:, 0])), torch.from_numpy(place[:, 0])
+    to_world = front.viewmat.double().inverse() @ seen @ rest.T_world_head[0].double().inverse()
+    cameras = tuple(replace(one, viewmat=(one.viewmat.double() @ to_world).float()) for one in true.cameras)
+    still = rest[[0] * len(true.face)]
+    low, high = model.expression_bounds.unbind(1)
+    face = replace(
+        still,
+        expression=(still.expression + true.face.expression - true.face.expression[0]).clamp(low, high),
+        joints=still.joints + true.face.joints - true.face.joints[0],
+    )
+    return replace(pictures, truth=replace(pictures.truth, tracking=replace(true, face=face, cameras=cameras)))
 
 
 def score_unfilmed(
