@@ -31,8 +31,6 @@ from mien.runtime import baked
 from mien.runtime.baked import About, BakedAvatar, Filmed, Neutral, PortableAvatar, Rig
 from mien.runtime.filmed import head_angles
 
-_FILMED_LEAST_SPREAD = 0.3  # spread that every direction of expressions has at least, relative to the largest
-
 
 @torch.no_grad()
 def bake_rig(face_model: FaceModel, subject: FaceParams) -> Rig:
@@ -90,23 +88,17 @@ def make_portable(avatar: Avatar, camera: Camera, name: str, to_share: bool = Tr
 
 
 @torch.no_grad()
-def measure_filmed(face: FaceParams, neutral: FaceParams, eyes: Float[Tensor, "b 3"]) -> Filmed:
+def measure_filmed(face: FaceParams, eyes: Float[Tensor, "b 3"]) -> Filmed:
     """The range of some training frames: expressions and head poses, which driving keeps to.
 
-    `neutral` is the person at rest, and `eyes` are the cameras' positions in world space, in metres.
+    `eyes` are the cameras' positions in world space, in metres.
     """
-    inputs = expression_inputs(face.detach()).double().cpu()
-    offsets = inputs - expression_inputs(neutral.detach())[0].double().cpu()
-    variances, vectors = torch.linalg.eigh(offsets.T @ offsets / len(offsets))
-    least = max(_FILMED_LEAST_SPREAD**2 * float(variances[-1]), 1e-6)
-    directions = vectors / (variances.clamp_min(0) + least).sqrt()
+    inputs = expression_inputs(face.detach()).float().cpu()
     poses = (face.head_rotation, face.head_translation, eyes)
     angles = head_angles(*(tensor.detach().double().cpu().numpy() for tensor in poses))
     return Filmed(
-        lowest=inputs.amin(0).float().numpy(),
-        highest=inputs.amax(0).float().numpy(),
-        directions=directions.float().numpy(),
-        reach=(offsets @ directions).norm(dim=1).amax(0, keepdim=True).float().numpy(),
+        lowest=inputs.amin(0).numpy(),
+        highest=inputs.amax(0).numpy(),
         head_angles=np.stack([angles.min(0), angles.max(0)], axis=1).astype(np.float32),
     )
 

@@ -192,7 +192,7 @@ class Follower:
         bounds = self._model.expression_bounds
         face = drive(driver, at_rest, self._at_rest, bounds, self._options.head_pose)
         if self._filmed is not None:
-            face, _ = keep_to_filmed(face, self._filmed, self._person, bounds, self._eye)
+            face = keep_to_filmed(face, self._filmed, self._person, self._model, self._eye)[0]
         return Face(
             *(as_array(field)[0] for field in (face.expression, face.joints, face.head_rotation, face.head_translation))
         )

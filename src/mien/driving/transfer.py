@@ -3,6 +3,7 @@
 Expressions, gaze and head poses that training never saw are softened (`keep_to_filmed`).
 """
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -115,26 +116,30 @@ def keep_to_filmed(
     face: FaceParams,
     filmed: Filmed,
     neutral: FaceParams,
-    expression_bounds: Float[Tensor, "e 2"],
+    model: FaceModel,
     eye: Float[Tensor, " 3"],
-) -> tuple[FaceParams, int]:
-    """Return the face softly within what training saw of this person, and how many timesteps that changes.
+) -> tuple[FaceParams, int, list[str]]:
+    """Return the face softly within what training saw of this person, how many timesteps that changes, and what of it.
 
     `neutral` is one timestep of this person at rest, and `eye` the position in metres of the camera that will see the
-    avatar, in world space.
+    avatar, in world space. What changes is named by expression or joint, or as `head`, the most frequent first.
     """
     count = face.expression.shape[1]
     inputs = as_array(torch.cat([face.expression, face.joints.flatten(1)], dim=1))
     rest = as_array(torch.cat([neutral.expression, neutral.joints.flatten(1)], dim=1))[0]
-    kept = within_filmed_inputs(filmed, inputs, rest, as_array(expression_bounds))
+    kept = within_filmed_inputs(filmed, inputs, rest, as_array(model.expression_bounds), model.expression_names)
     rotation, translation = as_array(face.head_rotation), as_array(face.head_translation)
     turned = within_filmed_poses(filmed, rotation, translation, as_array(eye))
     # Smaller changes of a coefficient, or of an angle in radians, are not seen.
-    changed = (np.abs(kept - inputs).max(1) > 1e-3) | (np.abs(turned - rotation).max(1) > 1e-3)
+    names = [*model.expression_names, *(name for name in model.free_joint_names for _ in range(3)), *["head"] * 3]
+    beyond = np.abs(np.concatenate([kept - inputs, turned - rotation], axis=1)) > 1e-3
+    often = Counter({name: 0 for name in names})
+    for name, times in zip(names, beyond.sum(0).tolist(), strict=True):
+        often[name] = max(often[name], times)
     limited = replace(
         face,
         expression=torch.from_numpy(kept[:, :count].copy()).to(face.expression),
         joints=torch.from_numpy(kept[:, count:].copy()).to(face.joints).reshape(face.joints.shape),
         head_rotation=torch.from_numpy(turned).to(face.head_rotation),
     )
-    return limited, int(changed.sum())
+    return limited, int(beyond.any(1).sum()), [name for name, times in often.most_common() if times]

@@ -139,9 +139,10 @@ def run_driving_stage(
     camera = filmed_by.fitted(*picture.shape())
     if not follow.unlimited:
         filmed = filmed_range(run_dir, avatar)
-        driven, softened = keep_to_filmed(driven, filmed, avatar.subject, bounds, camera.position)
+        driven, softened, parts = keep_to_filmed(driven, filmed, avatar.subject, avatar.face_model, camera.position)
         if softened:
             say(f"{softened} of {len(driven)} frames go beyond what was filmed and are softened; --unlimited lets go")
+            say(f"softened most: {', '.join(parts[:5])}")
     beside = None if alone or output.transparent else driver.pictures
     pose = posed_softly(avatar)
 

@@ -79,7 +79,7 @@ def clip_of(
         face = drive(driver.face, driver.at_rest, person, model.expression_bounds, True, str(by))
         if portable.filmed is not None:
             eye = _position(portable.camera)
-            face, _ = keep_to_filmed(face, portable.filmed, subject, model.expression_bounds, eye)
+            face = keep_to_filmed(face, portable.filmed, subject, model, eye)[0]
         fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
         return Clip(Motion(*map(as_array, fields), fps=driver.fps), driver.pictures)
 

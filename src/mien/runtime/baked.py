@@ -284,10 +284,6 @@ class Filmed:
     lowest: Float32[np.ndarray, " i"]
     """Smallest value of each input in the training frames."""
     highest: Float32[np.ndarray, " i"]
-    directions: Float32[np.ndarray, "i i"]
-    """Factors with which differences from the person at rest have about unit spread in every direction."""
-    reach: Float32[np.ndarray, " 1"]
-    """Largest length of (inputs - rest) directions in the training frames."""
     head_angles: Float32[np.ndarray, "2 2"]
     """Yaw and pitch of the camera as the head sees it, each from the lowest to the highest, in radians. Yaw is positive
     to the subject's left, pitch upwards."""

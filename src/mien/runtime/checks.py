@@ -49,7 +49,7 @@ def filmed_fault(filmed: Filmed, inputs: int) -> str | None:
         return fault
     if (filmed.lowest > filmed.highest).any() or (filmed.head_angles[:, 0] > filmed.head_angles[:, 1]).any():
         return "the lowest of what was filmed is above the highest"
-    return "the reach of what was filmed is negative" if filmed.reach[0] < 0 else None
+    return None
 
 
 def _faults(avatar: PortableAvatar) -> Iterator[str]:

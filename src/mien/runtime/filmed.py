@@ -1,8 +1,10 @@
-"""Soft limits that keep a driven avatar near what training saw: of the expression, the joints and the head's pose.
+"""Soft limits that keep a driven avatar near what training saw: of each expression, joint, and side of the head.
 
 Inside the filmed range nothing changes. Beyond it, values approach a limit that they never reach, with a continuous
-slope, so that motion stays smooth. All of it needs only numpy.
+slope, so that motion stays smooth. Common expressions have no limit but the face model's. All of it needs only numpy.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -10,8 +12,14 @@ from jaxtyping import Float, Float32
 from mien.runtime.baked import Filmed
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 
+COMMON = frozenset({
+    "jawOpen", "mouthSmileLeft", "mouthSmileRight", "mouthFunnel", "mouthPucker", "browInnerUp", "browOuterUpLeft",
+    "browOuterUpRight", "eyeBlinkLeft", "eyeBlinkRight",
+})  # fmt: skip
+"""ARKit's names of what everybody does: a smile, an open mouth, vowels, raised brows, shut eyes. They reach their full
+motion on every avatar: the mesh bends, and the appearance stays near its last filmed state (`ExpressionChanges`)."""
 ROOM = 0.3
-"""How far values get beyond what was filmed, as a share of the filmed distance from the person at rest."""
+"""How far other values get beyond what was filmed, as a share of the filmed distance from the person at rest."""
 LEAST_EXPRESSION = 0.2
 """Least of this room for an expression, as a share of the largest coefficient of the face model, because a mesh shows
 a little of any expression well."""
@@ -41,21 +49,20 @@ def within_filmed_inputs(
     inputs: Float[np.ndarray, "t i"],
     rest: Float[np.ndarray, " i"],
     bounds: Float[np.ndarray, "e 2"],
+    names: Sequence[str],
 ) -> Float32[np.ndarray, "t i"]:
     """Expression coefficients, followed by the free joints' axis-angle vectors in radians, softly within what was seen.
 
-    First each number on its own (`soft_limits`). Then all of them together: if their length |(inputs - rest)
-    directions| is beyond `reach`, all differences from `rest` are shortened by one factor, so that a rare combination
-    becomes weaker and keeps its kind. `bounds` are those of the coefficients that the face model can show.
+    Each number has limits of its own (`soft_limits`). `bounds` are those of the coefficients that the face model can
+    show, and `names` theirs: `COMMON` ones go up to them.
     """
     least = np.full(inputs.shape[1], LEAST_JOINT)
     least[: len(bounds)] = np.maximum(LEAST_EXPRESSION * np.abs(bounds).max(1), 1e-6)
-    start = rest.astype(np.float64)
-    each = soft_limits(inputs, filmed.lowest, filmed.highest, start, least) - start
-    lengths = np.sqrt(np.square(each @ filmed.directions.astype(np.float64)).sum(1, keepdims=True))
-    reach = max(float(filmed.reach[0]), 1e-6)
-    shortened = soft_limits(lengths, np.zeros(1), np.full(1, reach), np.zeros(1), 1e-6)
-    limited = (start + each * np.where(lengths > reach, shortened / np.maximum(lengths, 1e-9), 1.0)).astype(np.float32)
+    lowest, highest = filmed.lowest.astype(np.float64), filmed.highest.astype(np.float64)
+    common = np.flatnonzero([name in COMMON for name in names])
+    lowest[common] = np.minimum(lowest[common], bounds[common, 0])
+    highest[common] = np.maximum(highest[common], bounds[common, 1])
+    limited = soft_limits(inputs, lowest, highest, rest.astype(np.float64), least).astype(np.float32)
     # What is inside keeps its bits.
     return np.where(np.abs(limited - inputs) > 1e-6, limited, inputs)
 

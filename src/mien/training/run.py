@@ -159,7 +159,7 @@ def filmed_range(run_dir: Path, avatar: Avatar) -> "Filmed":
     if avatar.filmed is not None:
         return avatar.filmed
     face = read_face_track(run_dir, avatar.face_model)
-    return measure_filmed(face, avatar.subject, run_camera(run_dir).position.expand(len(face), 3))
+    return measure_filmed(face, run_camera(run_dir).position.expand(len(face), 3))
 
 
 def write_imported_run(run_dir: Path, avatar: Avatar, face: FaceParams, camera: Camera, source: Path) -> None:

@@ -246,7 +246,7 @@ def start(
         avatar = _first_avatar(method_config, face_model, concatenate(faces)[shown], settings)
     face = concatenate(faces)
     eyes = torch.stack([sequences[frame.sequence].tracking.cameras[frame.camera].position for frame in frames])
-    avatar.filmed = measure_filmed(face[used], avatar.subject, eyes)
+    avatar.filmed = measure_filmed(face[used], eyes)
     surface = avatar.extras.surface
     if surface is not None and surface.wants_first_colors:
         surface.set_first_colors(vertex_colors(footage))

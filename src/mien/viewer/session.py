@@ -140,7 +140,9 @@ class Session:
         if portable.filmed is not None:
             joints = portable.neutral.joints.reshape(-1)
             inputs, start = np.concatenate([expression, joints])[None], np.concatenate([rest, joints])
-            expression = within_filmed_inputs(portable.filmed, inputs, start, bounds)[0, : len(rest)]
+            expression = within_filmed_inputs(portable.filmed, inputs, start, bounds, portable.expression_names)[
+                0, : len(rest)
+            ]
         self._take(self.avatar.face(expression))
 
     def choose(self, name: str | None) -> None:

@@ -93,7 +93,6 @@ _CODES = {
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True, levels=1023),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
     "avatar.baked.rig.skinning_weights": _Code(16, "columns", signed=True),
-    "avatar.filmed.directions": _Code(16, "columns", signed=True),
     "motion.expression": _Code(16, "columns"),
     "motion.joints": _Code(16, "columns"),
     "motion.head_rotation": _Code(16, "columns"),
