@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from mien.adam import EPSILON, FactoredGradient, FactoredMoments, Moments
 from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.density import DensityControl
+from mien.avatar.resting import at_rest
 from mien.avatar.settings import TRAINED, MethodConfig, Progress, Rate
 from mien.avatar.store import GaussianStore
 from mien.face.model import FaceModel
@@ -136,7 +137,7 @@ class Avatar(nn.Module, ABC):
         self.config = config
         self.extras = extras
         self.face_model = face_model
-        self.subject = neutral_of(face)
+        self.subject = at_rest(face, face_model)
         """One timestep: this person's identity and offsets, and the face at rest."""
         self.filmed: Filmed | None = None
         """The part of the face that training saw. None if it is not known, as for imported avatars."""

@@ -98,7 +98,7 @@ def _load_avatar(folder: Path) -> Avatar:
         raise UserError(f"{folder}: its subject has {len(face)} timesteps instead of one; {_REMEDY}")
     with torch.random.fork_rng(devices=[]):
         avatar = method.avatar(for_loading(config), face_model, face)
-    avatar.config = config
+    avatar.config, avatar.subject = config, face
     overwrite(avatar, _with_prefix(tensors, "avatar."), content.gaussians, folder)
     avatar.filmed = _filmed(_with_prefix(tensors, "filmed."), avatar, folder)
     return avatar.eval()
@@ -109,7 +109,7 @@ def _filmed(tensors: dict[str, Tensor], avatar: Avatar, folder: Path) -> Filmed 
     if not tensors:
         return None
     with expect_whole(folder, _REMEDY):
-        filmed = Filmed(**{name: tensor.numpy() for name, tensor in tensors.items()})
+        filmed = Filmed(**{field.name: tensors[field.name].numpy() for field in fields(Filmed)})
         fault = filmed_fault(filmed, len(avatar.face_model.expression_names) + avatar.subject.joints[0].numel())
         if fault is not None:
             raise ValueError(fault)
