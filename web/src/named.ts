@@ -40,6 +40,15 @@ export function rangeOf(avatar: Avatar, name: string): [number, number] | undefi
   return eyeOf(avatar, name) || (preset && Object.keys(preset).every((part) => rangeOf(avatar, part))) ? [0, 1] : undefined;
 }
 
+/** How far a preset goes beyond what was filmed, at its coefficient that goes furthest; 0 if nobody knows what was. */
+export function beyondFilmed({ filmed, neutral, expression_names }: Avatar, name: string): number {
+  const over = Object.entries(presets[name]).map(([part, value]) => {
+    const index = expression_names.indexOf(part);
+    return filmed && index >= 0 ? neutral.expression[index] + value - filmed.highest[index] : 0;
+  });
+  return Math.max(0, ...over);
+}
+
 /**
  * Sets an expression, a gaze or a whole face by name, within its range.
  * @param look Coefficients of the gaze so far, by name in lower case; those of `name` are put into it.

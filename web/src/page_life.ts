@@ -2,13 +2,15 @@
 
 import { on } from "./controls";
 import { enliven, type Life } from "./alive";
-import { copyFace, type Face } from "./avatar";
-import { presets, rangeOf, setNamed } from "./named";
+import { type Avatar, copyFace, type Face } from "./avatar";
+import { beyondFilmed, presets, rangeOf, setNamed } from "./named";
 import { element, find, readable } from "./page_sliders";
 import type { Viewer } from "./viewer";
 
-/** Most faces that have a button. */
-const MOST_FACES = 8;
+/** Most and least faces that have a button. */
+const MOST_FACES = 8, LEAST_FACES = 5;
+/** How far a face goes beyond what was filmed when its button says so, and when it has none. */
+const TOLD_BEYOND = 0.5, MOST_BEYOND = 0.75;
 /** Time in which a face goes two thirds of its way, that of the eyes, and how long the first turn takes, in seconds. */
 const SOFT = 0.07, EYES = 0.12, FIRST = 1.6;
 /** Turn of the camera when the page opens, in radians, to the side of the head that the camera saw, and seconds after which eyes look ahead again. */
@@ -89,8 +91,9 @@ export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
       moveSliders();
     } else wake();
   };
-  for (const name of Object.keys(presets).filter((name) => rangeOf(avatar, name)).slice(0, MOST_FACES)) {
+  for (const name of facesOf(avatar)) {
     const label = readable(name), button = element("button", { "aria-pressed": "false" }, label[0].toUpperCase() + label.slice(1));
+    if (beyondFilmed(avatar, name) > TOLD_BEYOND) button.title = "Goes beyond what was filmed, so it may look less like the person";
     on(button, "click", () => show(name));
     buttons.set(name, button);
     find("faces").append(button);
@@ -117,4 +120,11 @@ export function addLife(viewer: Viewer, moveSliders: () => void): Alive {
   viewer.loop = false;
   if (!calm) viewer.play();
   return { show, stop };
+}
+
+/** The faces that have a button: those that go least beyond what was filmed, in the order of the table. */
+function facesOf(avatar: Avatar): string[] {
+  const all = Object.keys(presets).filter((name) => rangeOf(avatar, name)), beyond = new Map(all.map((name) => [name, beyondFilmed(avatar, name)]));
+  const least = [...all].sort((one, other) => beyond.get(one)! - beyond.get(other)!).slice(0, LEAST_FACES);
+  return all.filter((name) => beyond.get(name)! <= MOST_BEYOND || least.includes(name)).slice(0, MOST_FACES);
 }

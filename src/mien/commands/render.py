@@ -227,11 +227,11 @@ class Sheet(_Look):
     """Draw many pictures in one .png, each with its name.
 
     They are every expression at --strength (expressions), every expression at --strength times the most that was filmed
-    (filmed), or sides of the head, --span degrees from end to end (turntable). --size is that of one of them (default:
-    288, and 512 for sides).
+    (filmed), the preset faces of pages, also from aside (presets), or sides of the head, --span degrees from end to end
+    (turntable). --size is that of one of them (default: 288, and 512 for sides).
     """
 
-    kind: Annotated[Literal["expressions", "filmed", "turntable"], tyro.conf.Positional]
+    kind: Annotated[Literal["expressions", "filmed", "presets", "turntable"], tyro.conf.Positional]
     """What the pictures show."""
     out: Path | None = None
     """The .png (default: sheet_KIND.png in the run's folder)."""
@@ -271,6 +271,8 @@ class Sheet(_Look):
             tiles = sheets.turntable_tiles(face, camera, avatar.subject.head_translation[0], self.span)
         elif self.kind == "filmed":
             tiles = sheets.filmed_tiles(model, face, camera, filmed_range(run_dir, avatar), self.strength)
+        elif self.kind == "presets":
+            tiles = sheets.preset_tiles(model, face, camera, avatar.subject.head_translation[0])
         else:
             tiles = sheets.expression_tiles(model, face, camera, self.strength)
         sides = sides_filmed(run_dir, avatar) if self.kind == "turntable" else None

@@ -15,10 +15,11 @@ from mien.driving.motion import ARKIT_NAMES
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.media.pictures import WHITE, picture_grid
+from mien.pipeline.expression import with_expression
 from mien.render.camera_paths import orbit
 from mien.runtime.baked import Filmed
 from mien.runtime.camera_paths import zoom_for_all
-from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
+from mien.runtime.named import GAZE_NAMES, is_gaze, presets_for, turned_eyes
 
 TURNTABLE_TILES = 9
 """Number of angles on a sheet of a turntable."""
@@ -75,6 +76,17 @@ def filmed_tiles(model: FaceModel, face: FaceParams, camera: Camera, filmed: Fil
     return tiles
 
 
+def preset_tiles(model: FaceModel, face: FaceParams, camera: Camera, center: Float[Tensor, " 3"]) -> list[Tile]:
+    """The face as given and the preset faces of pages, first as the camera sees them, then from 20 degrees aside."""
+    faces = {"as it is": face}
+    faces |= {
+        name.replace("_", " "): with_expression(face, model, (f"{name}=1",))
+        for name in presets_for(model.expression_names, model.free_joint_names)
+    }
+    sides = {"": camera, ", aside": orbit(camera, center, math.radians(20))}
+    return [Tile(f"{name}{side}", own, seen) for side, seen in sides.items() for name, own in faces.items()]
+
+
 def turntable_tiles(face: FaceParams, camera: Camera, center: Float[Tensor, " 3"], degrees: float) -> list[Tile]:
     """The face from `TURNTABLE_TILES` sides, from the person's right to the left, `degrees` apart from end to end.
 
@@ -82,7 +94,7 @@ def turntable_tiles(face: FaceParams, camera: Camera, center: Float[Tensor, " 3"
     """
     gaps = TURNTABLE_TILES if abs(degrees) >= 360 else TURNTABLE_TILES - 1
     angles = [degrees * (index / gaps - 0.5) for index in range(TURNTABLE_TILES)]
-    names = [f"{angle:+.0f} degrees" if round(angle) else "front" for angle in angles]
+    names = [f"{angle:+.0f} degrees" if round(angle) else "as filmed" for angle in angles]
     cameras = [orbit(camera, center, math.radians(angle)) for angle in angles]
     return [Tile(name, face, camera) for name, camera in zip(names, cameras, strict=True)]
 
