@@ -39,9 +39,10 @@ class ExpressionActivations(nn.Module):
 
     The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. A
     region's activations go along the principal directions of what moves its own vertices, so that a brow does not
-    change with the mouth. Coefficients of a tracked clip also follow the turns of the head: without activations of its
-    pose, Gaussians learn light and misfit by expressions. Both are scaled so that those of the given timesteps have a
-    deviation of 1 or less. They are fixed: training changes only the bases of the Gaussians.
+    change with the mouth. Around the face, they go along those of the whole face. Coefficients of a tracked clip also
+    follow the turns of the head: without activations of its pose, Gaussians learn light and misfit by expressions. Both
+    are scaled so that those of the given timesteps have a deviation of 1 or less. They are fixed: training changes only
+    the bases of the Gaussians.
     """
 
     rest: Tensor
@@ -62,7 +63,10 @@ class ExpressionActivations(nn.Module):
         shares, motions = region_shares(face_model, neutral), vertex_motions(face_model, neutral)
         rest = expression_inputs(neutral)[0]
         offsets, own = expression_inputs(face) - rest, (count + 1) // 2
-        parts = [principal_directions(offsets, own, _weighted_root(motions, share)) for share in shares.unbind(1)]
+        roots = [_weighted_root(motions, share) for share in shares.unbind(1)]
+        if len(roots) > 1:
+            roots[-1] = None  # what is around the face moves with none of it, and changes with all of it
+        parts = [principal_directions(offsets, own, root) for root in roots]
         seen = [_EXPRESSIONS_BEYOND * outermost(offsets @ part) for part in parts]
         moved = head_motion(neutral, face)
         pose = principal_directions(moved, count // 2, torch.diag(moved.new_tensor([1.0] * 3 + [_SHIFT] * 3)))
