@@ -37,17 +37,9 @@ def plain_gaussian_avatars(**changes: Any) -> GaussianAvatarsConfig:
 def plain_mono_gaussian_avatar(**changes: Any) -> MonoGaussianAvatarConfig:
     """Some hundred points that start on a sphere, as in the paper."""
     plain = MonoGaussianAvatarConfig(
-        face_tuning=FaceTuning(begin=0.1),
-        frames_per_step=1,
-        start="sphere",
-        pretraining=0,
-        points=400,
-        max_points=10_000,
-        first_epoch=0,
-        epochs=100,
-        network_rate=Rate(1e-3, 1e-4),
-        own_rate=Rate(0.0),
-    )
+        face_tuning=FaceTuning(begin=0.1), frames_per_step=1, start="sphere", pretraining=0, points=400,
+        max_points=10_000, first_epoch=0, epochs=100, network_rate=Rate(1e-3, 1e-4), own_rate=Rate(0.0),
+    )  # fmt: skip
     return replace(plain, **changes)
 
 

@@ -13,15 +13,7 @@ import train_toy
 from mien.avatar import Avatar, load_avatar
 from mien.cli import main
 from mien.lab.analysis import mono_gaussian_avatar
-from mien.lab.analysis.mono_gaussian_avatar import (
-    Measured,
-    frontal_quarter,
-    masks,
-    measure,
-    mixed_half,
-    ranges,
-    scale_gain,
-)
+from mien.lab.analysis import mono_gaussian_avatar as analysis
 from mien.training import TrainSettings
 from mien.training.footage.frames import training_frames
 from plain_settings import plain_mono_gaussian_avatar
@@ -62,7 +54,7 @@ def test_times_stand_beside_the_papers(workspace: Path) -> None:
 @pytest.mark.slow
 def test_short_trainings_write_their_pictures(workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     # As in the paper: 0.0025 m from the middle between 512 and 1024 pixels on, which is at 724.
-    assert [scale_gain(side) for side in (128, 512, 720, 730, 1024, 2048)] == 3 * [0.00625] + 3 * [0.0025]
+    assert [analysis.scale_gain(side) for side in (128, 512, 720, 730, 1024, 2048)] == 3 * [0.00625] + 3 * [0.0025]
     monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {16: 0.004, 32: 0.00625})
     asked = ("--parts", "convergence", "resolutions", "diversity", "--steps", "10")
     parts = analyze(workspace, *asked)
@@ -101,29 +93,29 @@ def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.M
         assert torch.equal(tensor, seen[-1][name]), name
 
 
-def measured(angles: np.ndarray, expressions: np.ndarray) -> Measured:
-    return Measured(tuple((0, index) for index in range(len(angles))), angles, expressions)
+def measured(angles: np.ndarray, expressions: np.ndarray) -> analysis.Measured:
+    return analysis.Measured(tuple((0, index) for index in range(len(angles))), angles, expressions)
 
 
 def test_the_mixed_half_keeps_what_is_rare() -> None:
     angles, expressions = np.zeros((22, 2)), np.zeros((22, 3))
     angles[20, 0], expressions[21, 1] = 1.0, 4.0
     whole = measured(angles, expressions)
-    chosen = mixed_half(whole)
+    chosen = analysis.mixed_half(whole)
     assert len(chosen) == len(set(chosen)) == 11
     assert {20, 21} <= set(chosen)
-    assert ranges(whole, chosen)["yaw_range"] > ranges(whole, list(range(20)))["yaw_range"] == 0
+    assert analysis.ranges(whole, chosen)["yaw_range"] > analysis.ranges(whole, list(range(20)))["yaw_range"] == 0
     # Subsets are chosen among the frames of the training.
     _, sequence = toy_sequence(10, 32)
     frames = training_frames([sequence], TrainSettings(split="tail"))
-    found = measure([sequence], frames)
+    found = analysis.measure([sequence], frames)
     assert found.timesteps == tuple((0, index) for index in range(8))
     assert found.expressions.std(0)[sequence.tracking.face.expression[:8].std(0).numpy() > 0] == pytest.approx(1)
-    (mask,) = masks([sequence], found, [0, 3])
+    (mask,) = analysis.masks([sequence], found, [0, 3])
     assert mask.nonzero()[:, 0].tolist() == [0, 3]
-    assert ranges(found, list(range(8)))["expression_spread"] == pytest.approx(1)
+    assert analysis.ranges(found, list(range(8)))["expression_spread"] == pytest.approx(1)
 
 
 def test_the_frontal_quarter_has_the_views_nearest_to_the_median():
     yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
-    assert frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]
+    assert analysis.frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]

@@ -11,32 +11,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from mien import rotation
 from mien.camera import Camera, camera_from_fov, look_at
+from mien.capture.cameras import readings as ranking
 from mien.capture.cameras.head_path import consensus, find_head_path
-from mien.capture.cameras.readings import (
-    Ranked,
-    Reading,
-    advice_of,
-    is_wrong,
-    rank_readings,
-    readings_of,
-    ties_of,
-    warn_of_misfit,
-)
 from mien.errors import UserError
 from mien.face import load_face_model
-from mien.rotation import (
-    axis_angle_from_matrix,
-    axis_angle_from_quaternion,
-    compose_rigid,
-    invert_rigid,
-    matrix_from_axis_angle,
-    matrix_from_quaternion,
-    multiply_quaternions,
-    quaternion_from_matrix,
-    rigid_transform,
-    skew,
-)
 from mien.runtime import rotation as runtime_rotation
 
 
@@ -48,7 +28,7 @@ def vectors_of(size: int, most: float) -> st.SearchStrategy[Tensor]:
 numbers = st.floats(-2, 2, allow_nan=False, width=32)
 vectors = vectors_of(3, 2)
 sizes = st.integers(1, 2000)
-poses = st.tuples(vectors, vectors).map(lambda v: rigid_transform(matrix_from_axis_angle(v[0]), v[1]))
+poses = st.tuples(vectors, vectors).map(lambda v: rotation.rigid_transform(rotation.matrix_from_axis_angle(v[0]), v[1]))
 
 FEW = settings(max_examples=30)
 
@@ -129,62 +109,62 @@ def assert_rotation(matrix: Tensor) -> None:
 
 @given(turns, turns)
 def test_axis_angle_gives_rotations_that_keep_their_axis_and_comes_back(axis_angle: Tensor, other: Tensor) -> None:
-    agree(skew(axis_angle) @ other, torch.linalg.cross(axis_angle, other))
-    matrix = matrix_from_axis_angle(axis_angle)
+    agree(rotation.skew(axis_angle) @ other, torch.linalg.cross(axis_angle, other))
+    matrix = rotation.matrix_from_axis_angle(axis_angle)
     assert_rotation(matrix)
     agree(matrix @ axis_angle, axis_angle)
     agree(torch.trace(matrix), 1 + 2 * torch.cos(axis_angle.norm()))
-    agree(matrix_from_axis_angle(-axis_angle), matrix.T)
-    recovered = axis_angle_from_matrix(matrix)
+    agree(rotation.matrix_from_axis_angle(-axis_angle), matrix.T)
+    recovered = rotation.axis_angle_from_matrix(matrix)
     assert recovered.norm() <= math.pi + 1e-6
-    agree(matrix_from_axis_angle(recovered), matrix, 1e-7)
+    agree(rotation.matrix_from_axis_angle(recovered), matrix, 1e-7)
     if axis_angle.norm() < math.pi - 1e-3:
         agree(recovered, axis_angle, 1e-6)
 
 
 @given(quaternions, quaternions)
 def test_quaternions_and_matrices_agree(quat: Tensor, other: Tensor) -> None:
-    matrix, unit = matrix_from_quaternion(quat), quat / quat.norm()
+    matrix, unit = rotation.matrix_from_quaternion(quat), quat / quat.norm()
     assert_rotation(matrix)
-    agree((quaternion_from_matrix(matrix) * unit).sum().abs(), torch.ones((), dtype=torch.float64))
-    agree(matrix_from_axis_angle(axis_angle_from_quaternion(unit)), matrix, 1e-7)
-    product = multiply_quaternions(quat, other)
-    agree(matrix_from_quaternion(product), matrix @ matrix_from_quaternion(other))
+    agree((rotation.quaternion_from_matrix(matrix) * unit).sum().abs(), torch.ones((), dtype=torch.float64))
+    agree(rotation.matrix_from_axis_angle(rotation.axis_angle_from_quaternion(unit)), matrix, 1e-7)
+    product = rotation.multiply_quaternions(quat, other)
+    agree(rotation.matrix_from_quaternion(product), matrix @ rotation.matrix_from_quaternion(other))
     agree(product.norm(), quat.norm() * other.norm())
 
 
 @given(st.lists(turns, min_size=1, max_size=4).map(torch.stack))
 def test_leading_axes_are_batches_and_rotations_without_torch_are_the_same(axis_angles: Tensor) -> None:
-    matrices = matrix_from_axis_angle(axis_angles[:, None])
-    quats = quaternion_from_matrix(matrices)
+    matrices = rotation.matrix_from_axis_angle(axis_angles[:, None])
+    quats = rotation.quaternion_from_matrix(matrices)
     for index, axis_angle in enumerate(axis_angles):
-        matrix = matrix_from_axis_angle(axis_angle)
+        matrix = rotation.matrix_from_axis_angle(axis_angle)
         agree(matrices[index, 0], matrix)
-        agree(quats[index, 0], quaternion_from_matrix(matrix))
+        agree(quats[index, 0], rotation.quaternion_from_matrix(matrix))
     found = runtime_rotation.matrix_from_axis_angle(axis_angles.numpy())
     agree(torch.from_numpy(found), matrices[:, 0])
     recovered = torch.from_numpy(runtime_rotation.axis_angle_from_matrix(found))
-    agree(matrix_from_axis_angle(recovered), matrices[:, 0], 1e-7)
+    agree(rotation.matrix_from_axis_angle(recovered), matrices[:, 0], 1e-7)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gradients_are_finite_at_every_angle_and_those_of_differences_around_zero(dtype: torch.dtype) -> None:
     for angle in (0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-4, math.pi):
         axis_angle = torch.tensor([0.6 * angle, -0.8 * angle, 0.0], dtype=dtype, requires_grad=True)
-        matrix = matrix_from_axis_angle(axis_angle)
-        (gradient,) = torch.autograd.grad(matrix.sum() + axis_angle_from_matrix(matrix).sum(), axis_angle)
+        matrix = rotation.matrix_from_axis_angle(axis_angle)
+        (gradient,) = torch.autograd.grad(matrix.sum() + rotation.axis_angle_from_matrix(matrix).sum(), axis_angle)
         assert gradient.isfinite().all(), angle
     for axis_angle in (torch.zeros(3), torch.tensor([5e-5, 0, 5e-5]), torch.tensor([2e-4, -3e-4, 0])):
-        assert torch.autograd.gradcheck(matrix_from_axis_angle, axis_angle.double().requires_grad_(), eps=1e-7)
+        assert torch.autograd.gradcheck(rotation.matrix_from_axis_angle, axis_angle.double().requires_grad_(), eps=1e-7)
 
 
 def test_known_turns_also_without_torch() -> None:
     x, y = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0])
-    agree(matrix_from_axis_angle(torch.tensor([0, 0, math.pi / 2])) @ x, y, 1e-6)
-    agree(matrix_from_quaternion(torch.tensor([1.0, 0, 0, 1])) @ x, y, 1e-6)
-    agree(matrix_from_quaternion(torch.zeros(4)), torch.eye(3))
+    agree(rotation.matrix_from_axis_angle(torch.tensor([0, 0, math.pi / 2])) @ x, y, 1e-6)
+    agree(rotation.matrix_from_quaternion(torch.tensor([1.0, 0, 0, 1])) @ x, y, 1e-6)
+    agree(rotation.matrix_from_quaternion(torch.zeros(4)), torch.eye(3))
     first, second = (torch.randn(4, 4, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2))
-    composed = compose_rigid(first, second)
+    composed = rotation.compose_rigid(first, second)
     torch.testing.assert_close(composed, first @ second)
     np.testing.assert_array_equal(composed.numpy(), runtime_rotation.compose_rigid(first.numpy(), second.numpy()))
 
@@ -210,9 +190,10 @@ RIGS = {
 WORLDS = {"room": None, "one camera": torch.eye(4), "one camera, OpenGL": FLIP}
 POSES: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "world to camera": (lambda viewmat: viewmat, ""),
-    "camera to world": (invert_rigid, "the matrices go from camera to world, so write the inverse of each viewmat"),
+    "camera to world": (
+        rotation.invert_rigid, "the matrices go from camera to world, so write the inverse of each viewmat"),
     "OpenGL": (lambda viewmat: FLIP @ viewmat, "the axes are OpenGL's, so change the signs of rows 2 and 3"),
-    "camera to world, OpenGL": (lambda viewmat: invert_rigid(FLIP @ viewmat),
+    "camera to world, OpenGL": (lambda viewmat: rotation.invert_rigid(FLIP @ viewmat),
         "go from camera to world with OpenGL's axes, so change the signs of columns 2 and 3 of each, and write"),
 }  # fmt: skip
 INTRINSICS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
@@ -250,7 +231,7 @@ def seen_by(cameras: list[Camera], marks: Tensor) -> np.ndarray:
 def written(cameras: list[Camera], world: str, pose: str = "world to camera", K: str = "pixels") -> list[Camera]:
     """Return cameras as a file has them: in a world of its own, with matrices and intrinsics in another form."""
     axes = WORLDS[world]
-    T_world_new = torch.eye(4) if axes is None else invert_rigid(cameras[0].viewmat) @ axes
+    T_world_new = torch.eye(4) if axes is None else rotation.invert_rigid(cameras[0].viewmat) @ axes
     return [
         replace(camera, viewmat=POSES[pose][0](camera.viewmat @ T_world_new), K=INTRINSICS[K][0](camera.K))
         for camera in cameras
@@ -267,18 +248,18 @@ READINGS = [
 
 @pytest.mark.parametrize(("rig", "world", "pose", "K"), READINGS)
 def test_every_reading_is_named_in_any_world(marks: Tensor, rig: str, world: str, pose: str, K: str) -> None:
-    found = rank_readings(seen_by(RIGS[rig], marks), readings_of(written(RIGS[rig], world, pose, K)))
-    tied = ties_of(found)
+    found = ranking.rank_readings(seen_by(RIGS[rig], marks), ranking.readings_of(written(RIGS[rig], world, pose, K)))
+    tied = ranking.ties_of(found)
     assert len(tied) == 1
     assert POSES[pose][1] in tied[0].reading.remedy
     assert INTRINSICS[K][1] in tied[0].reading.remedy
     assert tied[0].share < 0.02
-    assert is_wrong(found) == bool(POSES[pose][1] + INTRINSICS[K][1])
+    assert ranking.is_wrong(found) == bool(POSES[pose][1] + INTRINSICS[K][1])
 
 
 def told_of(cameras: list[Camera], pixels: np.ndarray, capsys) -> str:
     """Return the warning about a calibration."""
-    warn_of_misfit(rank_readings(pixels, readings_of(cameras)))
+    ranking.warn_of_misfit(ranking.rank_readings(pixels, ranking.readings_of(cameras)))
     return capsys.readouterr().err
 
 
@@ -298,15 +279,19 @@ def test_a_reading_that_agrees_on_a_face_inside_out_is_warned_of(marks: Tensor, 
 
 
 def test_ties_are_said_and_advice_is_part_of_the_refusal(marks: Tensor) -> None:
-    entries = [Ranked(Reading((text,) if text else (), ()), pixels, pixels / 100) for text, pixels in
+    entries = [ranking.Ranked(ranking.Reading((text,) if text else (), ()), pixels, pixels / 100) for text, pixels in
                (("write A", 0.7), ("write B", 0.8), ("write C", 4.0), ("", float("inf")))]  # fmt: skip
-    advice = advice_of(entries)
+    advice = ranking.advice_of(entries)
     assert "cannot tell 2 readings apart" in advice
     assert "(1) write A, which leaves 0.7 px; or (2) write B, which leaves 0.8 px" in advice
     assert "write C" not in advice
-    assert advice_of(entries[1:]) == "write B (points of the face then agree within 0.8 px)"
-    assert advice_of(entries[3:]) == ""
+    assert ranking.advice_of(entries[1:]) == "write B (points of the face then agree within 0.8 px)"
+    assert ranking.advice_of(entries[3:]) == ""
     given, pixels = written(RIGS["ring"], "room", "camera to world"), seen_by(RIGS["ring"], marks)
     refusal = "no two cameras ever .*; the matrices go from camera to world, .* agree within"
     with pytest.raises(UserError, match=refusal):
-        find_head_path(boxes_of(pixels), given, lambda: advice_of(rank_readings(pixels, readings_of(given))))
+        find_head_path(
+            boxes_of(pixels),
+            given,
+            lambda: ranking.advice_of(ranking.rank_readings(pixels, ranking.readings_of(given))),
+        )

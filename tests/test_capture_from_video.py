@@ -9,13 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture_helpers import (
-    assert_same_capture,
-    face_picture,
-    interrupt_at,
-    tree_bytes,
-    write_face_clip,
-)
+from capture_helpers import assert_same_capture, face_picture, interrupt_at, tree_bytes, write_face_clip
 from mien.capture import capture_video, process, read_capture
 from mien.capture.from_video import capture_video_parts
 from mien.capture.settings import CaptureSettings

@@ -19,16 +19,8 @@ from mien.face.head_parts import head_parts
 from mien.render import rasterize
 from mien.runtime.baked import Filmed
 from mien.training import train
+from mien.training.footage import filmed as films
 from mien.training.footage.coverage import Coverage, drawn_share, measure_coverage, smoothstep
-from mien.training.footage.filmed import (
-    FILE,
-    filmed_words,
-    filmed_yaws,
-    read_coverage,
-    view_of_head,
-    with_shown_angles,
-    write_coverage,
-)
 from mien.training.footage.frames import Footage, training_frames
 from mien.training.footage.sequence import Sequence
 from mien.training.trainer import density_strategy
@@ -160,7 +152,7 @@ def test_only_what_is_seen_is_trained_and_so_are_features(toy: Toy) -> None:
     gaussians = avatar.pose(sequence.tracking.face[0]).gaussians
     (gaussians.sh.sum() + gaussians.opacities.sum()).backward()
     (factored,) = (one for group in avatar.parameter_groups() for one in group.factored.values())
-    rows = factored.terms[0][0]
+    rows = factored.terms[0].rows
     expected = torch.where(filled_in[:, None], 0, rows)
     assert not rows.equal(expected)
     unseen.mask_gradients(avatar, surface_of(avatar))
@@ -222,7 +214,7 @@ def test_fills_close_the_head(toy: Toy) -> None:
     prior = SurfacePrior(hair, None, color.expand(len(filled_in), 3), filled_in.float(), filled_in)
     surface_of(avatar).close(prior)
     assert len(avatar.store) == len(filled_in)
-    camera = view_of_head(model.head_vertices(avatar.subject)[0], 180)
+    camera = films.view_of_head(model.head_vertices(avatar.subject)[0], 180)
     turned = replace(avatar.subject, head_rotation=torch.zeros(1, 3), head_translation=torch.zeros(1, 3))
     rendering = rasterize(avatar.pose(turned).gaussians.timestep(0), camera, torch.ones(3))
     assert rendering.alpha[56:72, 56:72].min() > 0.95
@@ -267,14 +259,14 @@ def test_a_run_keeps_its_coverage(toy: Toy, tmp_path: Path) -> None:
     plain = train([sequence], model, config, replace(SETTINGS, unseen="trained"), tmp_path / "plain")
     assert len(plain.store["face_index"].unique()) == len(model.faces)
     for name in ("whole", "plain"):  # each run knows what was filmed
-        assert torch.equal(known(read_coverage(tmp_path / name, model)).seen, seen)
+        assert torch.equal(known(films.read_coverage(tmp_path / name, model)).seen, seen)
 
 
 def test_coverage_of_another_face_model_is_refused(toy: Toy, tmp_path: Path) -> None:
     found = covered(toy)
-    write_coverage(tmp_path, found)
-    assert torch.equal(known(read_coverage(tmp_path, toy[0])).colors, found.colors)
-    refuses(FILE, read_coverage, tmp_path, load_face_model("anny"))
+    films.write_coverage(tmp_path, found)
+    assert torch.equal(known(films.read_coverage(tmp_path, toy[0])).colors, found.colors)
+    refuses(films.FILE, films.read_coverage, tmp_path, load_face_model("anny"))
 
 
 def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
@@ -286,17 +278,17 @@ def test_words_and_angles_say_which_sides_were_filmed(toy: Toy) -> None:
     front_and_left, left, lower, everything, nothing = (
         Coverage(shown, colors, ones) for shown in (*(side.float() for side in sides), ones, 0 * ones)
     )
-    assert filmed_yaws(model, vertices, everything) == (180, 180)
-    right, far = filmed_yaws(model, vertices, front_and_left) or (0, 0)
+    assert films.filmed_yaws(model, vertices, everything) == (180, 180)
+    right, far = films.filmed_yaws(model, vertices, front_and_left) or (0, 0)
     assert 5 <= right < 60 < far < 180
-    words = filmed_words(model, vertices, front_and_left)
+    words = films.filmed_words(model, vertices, front_and_left)
     assert f"{right} degrees on the person's right to {far} on the left" in words
-    assert "made up" in filmed_words(model, vertices, nothing)
+    assert "made up" in films.filmed_words(model, vertices, nothing)
     zeros, angles = np.zeros(1, np.float32), np.array([[-0.3, 0.1], [-0.2, 0.2]], np.float32)
-    filmed, degrees = Filmed(zeros, zeros, zeros[:, None], zeros, angles), np.degrees(angles)
+    filmed, degrees = Filmed(zeros, zeros, angles), np.degrees(angles)
     for coverage, expected in (
         (left, [[degrees[0, 0], 60], [-30, 30]]), (everything, [[-60, 60], [-30, 30]]), (nothing, degrees),
         (lower, [[-60, 60], [-30, degrees[1, 1]]]),
     ):  # fmt: skip
-        found = np.degrees(with_shown_angles(filmed, model, vertices, coverage).head_angles)
+        found = np.degrees(films.with_shown_angles(filmed, model, vertices, coverage).head_angles)
         np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -13,23 +13,10 @@ from evaluation_case import drawn_sequence, make_experiment, write_run, write_se
 from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.disk.files import read_json
-from mien.evaluation import evaluate
+from mien.evaluation import evaluate, protocols
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.image_folders import ImageFolders, read_crops, score_folders, write_crops
 from mien.evaluation.metrics import l1, psnr
-from mien.evaluation.protocols import (
-    AS_TRACKED,
-    AVATAR,
-    FITTED,
-    OPENED,
-    EvaluationSettings,
-    PartialScores,
-    drawn_frames,
-    evaluate_frames,
-    fit_face,
-    opened,
-    protocol_content,
-)
 from mien.evaluation.scoring import ScoreSettings
 from mien.evaluation.text import protocol_lines
 from mien.media.video import write_video
@@ -59,7 +46,7 @@ def test_the_same_pictures_get_the_same_figures_as_in_evaluate(tmp_path: Path) -
     experiment = make_experiment(20)
     folder, run_dir = write_sequence(tmp_path, experiment, experiment.sequences[0]), tmp_path / "runs" / "first"
     write_run(run_dir, experiment, [folder], plain_run(steps=2, checkpoint_every=2))
-    settings = EvaluationSettings(perceptual_frames=3, pictures=True, baselines=False, video_frames=0)
+    settings = protocols.EvaluationSettings(perceptual_frames=3, pictures=True, baselines=False, video_frames=0)
     entry = evaluate(run_dir, [folder], settings)["protocols"]["self_reenactment"]
     pictures = run_dir / "pictures" / "self_reenactment"
     scores = score_folders(ImageFolders(pictures / "rendering", pictures / "truth"), ScoreSettings(perceptual_frames=3))
@@ -163,7 +150,7 @@ def test_command(folders: ImageFolders, tmp_path: Path, capsys: pytest.CaptureFi
     assert "--fit-steps 0: give a number from 1 to 10000" in told
 
 
-QUICK = EvaluationSettings(perceptual=False, video_frames=0, baselines=False, threads=1)
+QUICK = protocols.EvaluationSettings(perceptual=False, video_frames=0, baselines=False, threads=1)
 FIT = replace(QUICK, fit_faces=True)
 
 
@@ -196,7 +183,7 @@ def test_fitted_faces_draw_the_picture_better_and_change_nothing_else(method: st
     start = experiment.face(frame)
     truth = target_image(experiment, frame)
     with torch.no_grad():
-        fitted = fit_face(experiment, [frame], 20)
+        fitted = protocols.fit_face(experiment, [frame], 20)
     assert l1(avatar_image(experiment, frame, fitted), truth) < 0.9 * l1(avatar_image(experiment, frame), truth)
     assert all(torch.equal(tensor, before[name]) for name, tensor in avatar.state_dict().items())
     assert [tensor.requires_grad for tensor in avatar.parameters()] == wanted
@@ -212,25 +199,30 @@ def test_fitted_faces_draw_the_picture_better_and_change_nothing_else(method: st
 def test_fits_are_a_third_figure_in_any_order_and_never_the_headline(tmp_path: Path) -> None:
     experiment = astray(make_experiment(10))
     frames = experiment.held_out_frames
-    for steps, shown in ((3, FITTED), (0, AVATAR)):
+    for steps, shown in ((3, protocols.FITTED), (0, protocols.AVATAR)):
         forward, backward = (
-            {frame: drawn for frame, drawn, _ in drawn_frames(experiment, list(order), {OPENED}, None, steps)}
+            {
+                frame: drawn
+                for frame, drawn, _ in protocols.drawn_frames(experiment, list(order), {protocols.OPENED}, None, steps)
+            }
             for order in (frames, frames[::-1])
         )
         for frame in frames:
             assert forward[frame][shown].equal(backward[frame][shown])
-            assert forward[frame][OPENED].equal(opened(forward[frame][shown])), "the fitted face, if there is one"
+            assert forward[frame][protocols.OPENED].equal(protocols.opened(forward[frame][shown])), (
+                "the fitted face, if there is one"
+            )
     experiment = astray(make_experiment(10))
-    plain = evaluate_frames(experiment, QUICK)
-    partial = PartialScores(tmp_path / "partial", "one")
-    scored = evaluate_frames(experiment, FIT, partial)
-    assert set(scored.scores) == {AVATAR, AS_TRACKED, FITTED}
-    assert scored.scores[AVATAR] == plain.scores[AVATAR]
-    without, entry = (protocol_content(experiment, each, FIT) for each in (plain, scored))
+    plain = protocols.evaluate_frames(experiment, QUICK)
+    partial = protocols.PartialScores(tmp_path / "partial", "one")
+    scored = protocols.evaluate_frames(experiment, FIT, partial)
+    assert set(scored.scores) == {protocols.AVATAR, protocols.AS_TRACKED, protocols.FITTED}
+    assert scored.scores[protocols.AVATAR] == plain.scores[protocols.AVATAR]
+    without, entry = (protocols.protocol_content(experiment, each, FIT) for each in (plain, scored))
     assert "fitted" not in without
     assert entry["psnr"] == without["psnr"]
     assert entry["fitted"]["psnr"] > entry["psnr"] + 1
     assert entry["fitted"]["head"]["psnr"] > entry["head"]["psnr"]
     assert entry["fitted"]["fit"]["steps"] == 20
     assert "fitted" not in protocol_lines("self_reenactment", entry)[1]
-    assert evaluate_frames(experiment, FIT, partial).scores == scored.scores, "resumed"
+    assert protocols.evaluate_frames(experiment, FIT, partial).scores == scored.scores, "resumed"

@@ -29,7 +29,7 @@ from mien.lab.benchmarking.unseen_views import Front, angle_names, camera_beside
 from mien.lab.synthetic.recipe import SIDES
 from mien.lab.synthetic.references import REFERENCES
 from mien.pipeline import drive as driving
-from mien.pipeline.sheets import TURNTABLE_TILES, Tile, expression_tiles, filmed_tiles, nearer_tiles, turntable_tiles
+from mien.pipeline import sheets
 from mien.pipeline.view import viewed_file
 from mien.render.camera_paths import orbit
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -144,10 +144,7 @@ def test_it_is_kept_in_a_run_and_in_a_mien_file_and_checked(tmp_path: Path) -> N
     for found in (load_avatar(tmp_path / "a").filmed, _written(tmp_path / "a.mien", avatar).filmed):
         assert found is not None
         assert all(np.array_equal(getattr(found, name), getattr(good, name)) for name in PARTS)
-    for change in (
-        {"lowest": good.highest + 1},
-        {"head_angles": good.head_angles[:, ::-1].copy()},
-    ):
+    for change in ({"lowest": good.highest + 1}, {"head_angles": good.head_angles[:, ::-1].copy()}):
         avatar.filmed = replace(good, **change)
         write_avatar(tmp_path / "a", avatar)
         refuses("filmed", load_avatar, tmp_path / "a")
@@ -193,7 +190,7 @@ workspace = pytest.fixture(toy_workspace)
 def test_every_expression_has_a_tile_whose_strength_is_relative_to_what_was_filmed() -> None:
     model = load_face_model("anny")
     face = model.neutral()
-    tiles = expression_tiles(model, face, CAMERA, 1.0)
+    tiles = sheets.expression_tiles(model, face, CAMERA, 1.0)
     names = [tile.name.split()[0] for tile in tiles[1:]]
     assert names == [name for name in ARKIT_NAMES if name not in ("mouthClose", "tongueOut")]
     for name, tile in zip(names, tiles[1:], strict=True):
@@ -204,20 +201,24 @@ def test_every_expression_has_a_tile_whose_strength_is_relative_to_what_was_film
         else:
             assert coefficients.nonzero().flatten().tolist() == [model.expression_names.index(name)], name
             assert not tile.face.joints.any(), name
-    strong = {tile.name for tile in expression_tiles(model, face, CAMERA, 1.5)}
+    strong = {tile.name for tile in sheets.expression_tiles(model, face, CAMERA, 1.5)}
     assert {"jawOpen 1.20", "browInnerUp 1.50"} <= strong, "coefficients stay within the bounds of the face model"
     model = make_small_face_model()
     count = len(model.expression_names)
     model = replace(model, expression_bounds=torch.tensor([[0.0, 1.0]]).repeat(count, 1))
     highest = np.linspace(0.2, 0.9, count + 3).astype(np.float32)
     filmed = Filmed(0 * highest, highest, np.zeros((2, 2), np.float32))
-    tiles = filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
+    tiles = sheets.filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
     shown = [float(tile.face.expression.max()) for tile in tiles[1:]]
     assert shown == pytest.approx([min(1.5 * value, 1.0) for value in highest[:count][::-1].tolist()])
+    tiles = sheets.preset_tiles(load_face_model("anny"), face, CAMERA, torch.zeros(3))
+    assert [tile.name for tile in tiles[::14]] == ["as it is", "as it is, aside"]
+    assert float(tiles[1].face.expression.max()) == pytest.approx(0.7), "a smile"
+    assert not torch.equal(tiles[14].camera.viewmat, CAMERA.viewmat)
     face, center = make_small_face_model().neutral(), torch.zeros(3)
-    tiles, around = (turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))
-    assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "front", "+60 degrees"]
-    assert len(tiles) == TURNTABLE_TILES
+    tiles, around = (sheets.turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))
+    assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "as filmed", "+60 degrees"]
+    assert len(tiles) == sheets.TURNTABLE_TILES
     torch.testing.assert_close(tiles[-1].camera.viewmat, orbit(CAMERA, torch.zeros(3), torch.pi / 3).viewmat)
     assert not torch.allclose(around[0].camera.viewmat, around[-1].camera.viewmat, atol=0.1)
 
@@ -234,13 +235,13 @@ def test_tiles_come_nearer_until_what_they_show_fills_them() -> None:
         return cv2.circle(wall(None, camera), (x, y), round(0.05 * float(camera.K[0, 0])), (255, 0, 0), -1)
 
     start = camera_from_fov(0.8, 200, 200, torch.eye(4))
-    tiles = [Tile("one", make_small_face_model().neutral(), start)]
-    near = nearer_tiles(tiles, ball, gray)[0].camera
+    tiles = [sheets.Tile("one", make_small_face_model().neutral(), start)]
+    near = sheets.nearer_tiles(tiles, ball, gray)[0].camera
     shown = (ball(None, near) != gray).any(-1)
     assert 0.7 < max(np.ptp(np.flatnonzero(shown.any(axis))) / 200 for axis in (0, 1)) < 0.98
     corner = torch.linalg.inv(start.K) @ torch.tensor([100.0, 200.0, 1.0])
     assert float((near.K @ corner)[1]) >= 199.99, "the picture's lower border stays at the border or beyond"
-    assert nearer_tiles(tiles, wall, gray) == tiles
+    assert sheets.nearer_tiles(tiles, wall, gray) == tiles
 
 
 @pytest.mark.parametrize("options", [["expressions"], ["filmed", "--strength", "1.5"], ["turntable", "--span", "180"]])

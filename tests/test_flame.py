@@ -123,14 +123,8 @@ def test_a_pickle_runs_nothing(arrays, model, tmp_path):
 FAULTS = {
     "a key": (lambda a: {"posedirs": None}, "no 'posedirs'.*it needs"),
     "the chain": (lambda a: {"kintree_table": None}, "no 'kintree_table'"),
-    "a body": (
-        lambda a: {"kintree_table": np.array([[-1, 0, 0, 0, 1], [0, 1, 2, 3, 4]])},
-        "body models .* give a head",
-    ),
-    "other vertices": (
-        lambda a: {"weights": a["weights"][1:]},
-        r"'weights' has the shape \[4172, 5\] of float64, not \[4173, 5\] of numbers",
-    ),
+    "a body": (lambda a: {"kintree_table": np.array([[-1, 0, 0, 0, 1], [0, 1, 2, 3, 4]])}, "body models .* a head"),
+    "other vertices": (lambda a: {"weights": a["weights"][1:]}, r"'weights' has .*4172, 5\] of float64,.*4173, 5\]"),
     "millimetres": (lambda a: {"v_template": 1000 * a["v_template"]}, "a head in metres with y upwards is 0.1 to"),
     "mirrored": (lambda a: {"v_template": a["v_template"] * [-1, 1, 1]}, "[+]x to the subject's left"),
     "not finite": (lambda a: {"posedirs": np.full_like(a["posedirs"], np.nan)}, "'posedirs'.*not finite"),

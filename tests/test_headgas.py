@@ -11,13 +11,7 @@ from known import known
 from mien.adam import FactoredMoments, Moments
 from mien.avatar.avatar import neutral_of
 from mien.avatar.baking import make_portable
-from mien.avatar.headgas.avatar import (
-    HeadGas,
-    input_directions,
-    neighbor_distances,
-    sample_surface,
-    spread_out,
-)
+from mien.avatar.headgas.avatar import HeadGas, input_directions, neighbor_distances, sample_surface, spread_out
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
@@ -32,6 +26,7 @@ from mien.runtime import pose
 from mien.training import PRESETS
 from mien.training.adam import Adam
 from mien.training.density_control.gradient import round_steps
+from test_feature_network import product
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(
@@ -101,8 +96,7 @@ def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None
         moved += [avatar.store["means"].grad] if encoding_gradient else []
         (group,) = [group for group in avatar.parameter_groups() if group.name == "bases"]
         if not factored_bases:
-            ((rows, columns),) = group.factored["bases"].terms
-            by_bases.append(rows[:, None] * columns[:, None])
+            by_bases += [product(*term) for term in group.factored["bases"].terms]
         before = avatar.store["bases"].detach().clone()
         Adam().step([group], Progress(0, 100))
         assert not before.equal(avatar.store["bases"])

@@ -46,7 +46,7 @@ def packed(header: dict[str, Any], arrays: bytes) -> bytes:
 
 
 def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path) -> None:
-    array, rig = "tensors/avatar.baked.means", "content/avatar/baked/rig"
+    array, rig, changes = "tensors/avatar.baked.means", "content/avatar/baked/rig", "content/avatar/baked/changes"
     header, arrays = parts()
     assert read_by_node(built, packed(header, arrays), tmp_path) == "", "the whole file is read"
     for place, value in (
@@ -57,8 +57,8 @@ def test_numbers_that_lead_nowhere_are_refused(built: Path, tmp_path: Path) -> N
         ("content/avatar/baked/means", {"tensor": "avatar.baked.rig.expression_basis", "length": 3e9}),
         ("content/avatar/baked", None), (f"{rig}/joint_template", [0, 1, 2]), (f"{rig}/joint_parents", [5, 5, 5]),
         (f"{rig}/joint_parents", [-1, [[]], 0]), (f"{rig}/joint_names", "x" * 100_000),
-        ("content/avatar/baked/changes/rest", [0]), ("content/avatar/neutral", None), ("content/avatar/camera", []),
-        ("content/motion", {"fps": 30}),
+        (f"{changes}/rest", [0]), (f"{changes}/shares", [0, 1]), (f"{changes}/head/rest", [0]),
+        ("content/avatar/neutral", None), ("content/avatar/camera", []), ("content/motion", {"fps": 30}),
     ):  # fmt: skip
         changed = copy.deepcopy(header)
         *way, last = place.split("/")

@@ -32,14 +32,7 @@ from mien.runtime import load as load_portable
 from mien.training import TrainSettings, read_sequence
 from mien.training.footage.frames import training_frames
 from mien.training.run import read_curves, read_face_track
-from mien.training.settings.splits import (
-    OwnSplit,
-    Recorded,
-    Recordings,
-    fill_in,
-    read_own_split,
-    write_own_split,
-)
+from mien.training.settings.splits import OwnSplit, Recorded, Recordings, fill_in, read_own_split, write_own_split
 from refusals import complaint
 from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 

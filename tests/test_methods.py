@@ -33,6 +33,7 @@ from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from plain_settings import plain_config, plain_gaussian_avatars, plain_mono_gaussian_avatar, plain_run
 from refusals import refuses
+from test_feature_network import product
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
 
 SIZE = 32
@@ -192,7 +193,7 @@ def _gradient_of(group: ParameterGroup, name: str) -> torch.Tensor | None:
     """The gradient of a tensor; one of factors is multiplied out."""
     if name not in group.factored:
         return group.tensors[name].grad
-    products = [rows[:, None] * columns[:, None] for rows, columns in group.factored[name].terms]
+    products = [product(*term) for term in group.factored[name].terms]
     return torch.stack(products).sum(0) if products else None
 
 

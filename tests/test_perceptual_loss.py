@@ -19,18 +19,10 @@ from mien.face import FaceModel
 from mien.gaussians import Rendering
 from mien.perceptual import weights_path
 from mien.perceptual.features import load_training_features
+from mien.training import losses as photometry
 from mien.training import train
 from mien.training.footage.frames import CROP, random_at
 from mien.training.footage.sequence import Sequence, Target, Targets
-from mien.training.losses import (
-    differentiable_ssim_map,
-    drawn_crop,
-    perceptual_goal,
-    perceptual_loss,
-    person_box,
-    photometric_loss,
-    photometric_loss_reference,
-)
 from mien.training.run import read_curves
 from rasterize_scenes import relative_error
 from toy_scene import toy_sequence
@@ -69,14 +61,16 @@ def test_the_distance_is_that_of_the_networks_layers_in_crops_of_every_part() ->
     assert float(features(target, target)) == 0
     assert float(features(image, target)) == pytest.approx(by_torchs_layers(image, target), rel=1e-3)
     target = some_target(((20, 10, 30, 10), (70, 50, 8, 8)))
-    crops, again = ([drawn_crop(target, 24, random_at(0, CROP, step)) for step in range(200)] for _ in range(2))
+    crops, again = (
+        [photometry.drawn_crop(target, 24, random_at(0, CROP, step)) for step in range(200)] for _ in range(2)
+    )
     assert crops == again
     assert all(x >= 0 and y >= 0 and x + 24 <= 80 and y + 24 <= 60 for x, y, _, _ in crops)
     assert {crop[2:] for crop in crops} == {(24, 24)}
     near_mouth = sum(crop[:2] == (56, 36) for crop in crops)
     assert 30 < near_mouth < 110, "a third of the crops is drawn around the part at the corner"
     assert len(set(crops)) > 80, "the others differ"
-    assert drawn_crop(target, 512, random_at(0, CROP, 0)) == (0, 0, 80, 60)
+    assert photometry.drawn_crop(target, 512, random_at(0, CROP, 0)) == (0, 0, 80, 60)
 
 
 def some_target(parts: tuple[tuple[int, int, int, int], ...], height: int = 60, width: int = 80) -> Target:
@@ -89,8 +83,8 @@ def loss_of(width: int, settings: PerceptualLoss) -> tuple[float, torch.Size]:
     image, radii = torch.full((64, width, 3), 0.5), torch.zeros(1, dtype=torch.int32)
     rendering = Rendering(image, torch.ones(64, width), radii, torch.zeros(1, 2))
     target = replace(some_target((), 64, width), picture=torch.full((64, width, 3), 90, dtype=torch.uint8))
-    goal = perceptual_goal(target, settings, random_at(0, CROP, 0))
-    return float(perceptual_loss(rendering, goal, settings)), target.picture[goal.crop].shape
+    goal = photometry.perceptual_goal(target, settings, random_at(0, CROP, 0))
+    return float(photometry.perceptual_loss(rendering, goal, settings)), target.picture[goal.crop].shape
 
 
 def whole(side: int) -> float:
@@ -111,7 +105,7 @@ def test_the_whole_person_counts_fully() -> None:
     found = [loss_of(width, PerceptualLoss(weight=2.0, region="person", crop=16)) for width in (64, 128)]
     assert found == [(pytest.approx(2.0 * whole(50), rel=1e-5), (50, 50, 3))] * 2
     boxes = {(10, 5, 50, 40): (10, 5, 50, 40), (0, 0, 0, 0): (0, 0, 16, 16), (78, 59, 2, 1): (64, 44, 16, 16)}
-    assert {box: person_box(replace(some_target(()), box=box)) for box in boxes} == boxes
+    assert {box: photometry.person_box(replace(some_target(()), box=box)) for box in boxes} == boxes
 
 
 CONFIG = replace(
@@ -181,7 +175,7 @@ def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
 def exact(image: Tensor, target: Tensor, weights: tuple[float, float], box: Box | None) -> tuple[Tensor, Tensor]:
     """Return value and gradient in float64."""
     image = image.double().requires_grad_()
-    loss = photometric_loss_reference(image, target.double(), *weights, box)
+    loss = photometry.photometric_loss_reference(image, target.double(), *weights, box)
     return loss.detach(), torch.autograd.grad(loss, image)[0]
 
 
@@ -191,7 +185,7 @@ def test_value_and_gradient_equal_the_float64_reference(isa, height, width, box,
     image, target = pair(height, width)
     value, gradient = exact(image, target, weights, box)
     image.requires_grad_()
-    loss = photometric_loss(image, target, *weights, box)
+    loss = photometry.photometric_loss(image, target, *weights, box)
     (3 * loss).backward()
     assert image.grad is not None
     torch.testing.assert_close(loss.detach().double(), value, atol=1e-6, rtol=1e-6)
@@ -200,13 +194,13 @@ def test_value_and_gradient_equal_the_float64_reference(isa, height, width, box,
     try:
         for threads in (1, 2, 3):
             _native.set_thread_count(threads)
-            again = photometric_loss(image, target, *weights, box)
+            again = photometry.photometric_loss(image, target, *weights, box)
             assert again == loss
             assert torch.equal(torch.autograd.grad(3 * again, image)[0], image.grad)
     finally:
         _native.set_thread_count(0)
     with torch.no_grad():
-        assert photometric_loss(image, target, *weights, box) == loss
+        assert photometry.photometric_loss(image, target, *weights, box) == loss
 
 
 def test_a_box_around_all_differences_changes_nothing():
@@ -215,14 +209,14 @@ def test_a_box_around_all_differences_changes_nothing():
     image[25:35, 30:50] += 0.1 * torch.randn(10, 20, 3, generator=torch.Generator().manual_seed(3))
     image.requires_grad_()
     box = (25, 20, 30, 20)  # 5 pixels of margin
-    whole, part = photometric_loss(image, target), photometric_loss(image, target, box=box)
+    whole, part = photometry.photometric_loss(image, target), photometry.photometric_loss(image, target, box=box)
     torch.testing.assert_close(whole, part, atol=1e-7, rtol=1e-6)
     differences = torch.autograd.grad(whole, image)[0] - torch.autograd.grad(part, image)[0]
     assert differences.abs().max() < 1e-7
     # Equal pictures lose nothing, and neither does a box outside of the picture.
-    assert differentiable_ssim_map(target, target).mean() == 1
-    assert abs(float(photometric_loss(target, target))) < 1e-6
-    assert photometric_loss(target, target, box=(80, 60, 10, 10)) == 0
+    assert photometry.differentiable_ssim_map(target, target).mean() == 1
+    assert abs(float(photometry.photometric_loss(target, target))) < 1e-6
+    assert photometry.photometric_loss(target, target, box=(80, 60, 10, 10)) == 0
 
 
 def test_ssim_follows_its_formula():
@@ -236,11 +230,11 @@ def test_ssim_follows_its_formula():
     covariance = (window * (x - mean_x) * (y - mean_y)).sum()
     expected = (2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)
     expected /= (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
-    torch.testing.assert_close(differentiable_ssim_map(image, target)[17, 14, 1], expected)
+    torch.testing.assert_close(photometry.differentiable_ssim_map(image, target)[17, 14, 1], expected)
     # Zeros beyond the border.
     mean_at_corner = conv2d(image[None, None, :, :, 0], window[None, None], padding=5)[0, 0, 0, 0]
     black = torch.zeros_like(image)
-    assert differentiable_ssim_map(image, black)[0, 0, 0] < 1e-4 / (mean_at_corner**2 + 1e-4)
+    assert photometry.differentiable_ssim_map(image, black)[0, 0, 0] < 1e-4 / (mean_at_corner**2 + 1e-4)
 
 
 @pytest.mark.parametrize("bytes_given", [False, True])
@@ -250,17 +244,17 @@ def test_parts_count_again_as_pictures_of_their_own(isa: str, bytes_given: bool)
     parts = [(5, 7, 20, 11), (40, 20, 30, 30), (2, 2, 4, 9)]  # the second reaches beyond the picture
     wanted = image.double().requires_grad_()
     goal = target.double() / (255 if bytes_given else 1)
-    loss = photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
-    by_hand = photometric_loss_reference(wanted, goal)
+    loss = photometry.photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
+    by_hand = photometry.photometric_loss_reference(wanted, goal)
     for left, top, width, height in parts:
         rows, columns = slice(top, top + height), slice(left, left + width)
-        cut = photometric_loss_reference(wanted[rows, columns], goal[rows, columns])
+        cut = photometry.photometric_loss_reference(wanted[rows, columns], goal[rows, columns])
         by_hand = by_hand + 1.5 * cut * wanted[rows, columns].numel() / wanted.numel()
     assert float(loss.detach()) == pytest.approx(float(by_hand.detach()), rel=1e-12)
     parts = parts[:2]  # the third is too narrow for the native path
-    loss = photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
+    loss = photometry.photometric_loss_reference(wanted, goal, parts=parts, part_weight=1.5)
     found = image.clone().requires_grad_()
-    native = photometric_loss(found, target, parts=parts, part_weight=1.5)
+    native = photometry.photometric_loss(found, target, parts=parts, part_weight=1.5)
     assert float(native.detach()) == pytest.approx(float(loss.detach()), rel=1e-5)
     gradient = torch.autograd.grad(native, found)[0]
     assert relative_error(gradient, torch.autograd.grad(loss, wanted)[0]) < 1e-4

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import photometric_case as cases
 from mien import _native
 from mien.camera import Camera
 from mien.render.mesh import Texture as MeshTexture
@@ -31,35 +32,26 @@ from mien.tracking.pixels.texture import (
 from mien.tracking.report.residuals import residual_report
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 from mien.tracking.tracking import Tracking
-from photometric_case import (
-    FOCAL,
-    SIZE,
-    PhotometricCase,
-    assert_alike,
-    make_photometric_case,
-    make_textured_model,
-    smooth_noise,
-)
 
-LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks")
+LANDMARKS = TrackingSettings(focal=cases.FOCAL, schedule="landmarks")
 FAST = replace(
     LANDMARKS, schedule="fast",
     photometric=PhotometricSettings(texture_size=128, keyframes=8, shared_steps=1),
 )  # fmt: skip
 
 
-case = pytest.fixture(scope="module")(lambda: make_photometric_case())
+case = pytest.fixture(scope="module")(lambda: cases.make_photometric_case())
 by_landmarks = pytest.fixture(scope="module")(lambda case: track(case.capture, case.model, LANDMARKS))
 
 
-def wobble(case: PhotometricCase, tracking: Tracking) -> float:
+def wobble(case: cases.PhotometricCase, tracking: Tracking) -> float:
     """Return the median deviation of landmarks from their mean error, in pixels."""
     points = case.model.landmark_positions(case.model(tracking.face), "mediapipe")
     error = tracking.cameras[0].project(points)[0] - case.landmarks
     return float((error - error.mean(0)).norm(dim=-1).median())
 
 
-def turn_error(case: PhotometricCase, tracking: Tracking) -> float:
+def turn_error(case: cases.PhotometricCase, tracking: Tracking) -> float:
     """Return the median deviation of the rotation from its mean error, in degrees."""
     turn = matrix_from_axis_angle(tracking.face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
     vector = torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], dim=-1)
@@ -72,7 +64,7 @@ def test_pixels_calm_what_landmarks_leave(case, by_landmarks, monkeypatch):
     for threads in ("1", "3"):
         monkeypatch.setenv("MIEN_THREADS", threads)
         runs.append(track(case.capture, case.model, FAST))
-    assert_alike(*runs)
+    cases.assert_alike(*runs)
     by_pixels = runs[0]
     assert wobble(case, by_pixels) < 0.5 * wobble(case, by_landmarks)
     assert turn_error(case, by_pixels) < 0.3
@@ -106,7 +98,7 @@ def test_pictures_that_show_something_else_fall_back_to_landmarks_and_say_so(cas
 
 @pytest.mark.unchecked
 def test_sequences_of_one_subject_share_texture_and_identity(case):
-    short = make_photometric_case(timesteps=7)
+    short = cases.make_photometric_case(timesteps=7)
     found = track_subject([case.capture, short.capture], case.model, FAST)
     assert [len(tracking.face) for tracking in found] == [16, 7]
     assert torch.equal(found[0].face.identity, found[1].face.identity)
@@ -117,7 +109,7 @@ def test_sequences_of_one_subject_share_texture_and_identity(case):
 
 
 def test_derivatives_of_the_surface_are_those_of_the_face_model():
-    model, generator = make_textured_model(), torch.Generator().manual_seed(0)
+    model, generator = cases.make_textured_model(), torch.Generator().manual_seed(0)
     model = replace(model, pose_basis=0.002 * torch.randn(27, *model.template.shape, generator=generator))
     layout = layout_of(model)
     state = 0.3 * torch.rand(layout.size, generator=generator, dtype=torch.float64)
@@ -139,18 +131,18 @@ def test_derivatives_of_the_surface_are_those_of_the_face_model():
         assert difference < 2e-4 * expected.abs().max() + 1e-7, index
 
 
-def term_of(case: PhotometricCase) -> OutlineTerm:
+def term_of(case: cases.PhotometricCase) -> OutlineTerm:
     rows = torch.arange(len(case.face))
     views = Views(case.landmarks.double(), rows, torch.zeros_like(rows), torch.ones(len(rows), dtype=torch.float64))
     return outline_term(surface_model(case.model, layout_of(case.model)), case.capture, rows, views, 10.0)
 
 
 @pytest.fixture(scope="module")
-def short_case() -> PhotometricCase:
-    return make_photometric_case(timesteps=8)
+def short_case() -> cases.PhotometricCase:
+    return cases.make_photometric_case(timesteps=8)
 
 
-def equations_of(case: PhotometricCase, term: OutlineTerm, shift: tuple[float, float] = (0, 0)):
+def equations_of(case: cases.PhotometricCase, term: OutlineTerm, shift: tuple[float, float] = (0, 0)):
     """Return the equations of the timesteps and of what they share, with the head shifted away from the truth."""
     layout, face = layout_of(case.model), case.face
     expression, joints = face.expression[:, layout.expression_index], face.joints.flatten(1)[:, layout.joint_index]
@@ -169,7 +161,9 @@ def test_the_true_outline_lies_where_the_matte_ends_and_pulls_a_shifted_head_bac
         assert torch.allclose(outline.normals.norm(dim=1), torch.ones(len(outline.points)), atol=1e-5)
         outwards = ((outline.points - outline.points.mean(0)) * outline.normals).sum(1) > 0
         assert outwards.float().mean() > 0.9
-        assert edge_distances(np.full((SIZE, SIZE), 255, np.uint8), outline, 8.0).isnan().all(), "out of reach"
+        assert edge_distances(np.full((cases.SIZE, cases.SIZE), 255, np.uint8), outline, 8.0).isnan().all(), (
+            "out of reach"
+        )
     shift, term = (0.003, -0.002), term_of(short_case)  # 1.2 and 0.8 pixels
     frames, _ = equations_of(short_case, term, shift)
     step = -torch.linalg.solve(frames.hessian[:, 3:5, 3:5], frames.gradient[:, 3:5])
@@ -206,7 +200,7 @@ def test_timesteps_between_keyframes_move_as_these_do():
 
 
 SIDE, SIGMA, OUTLIER, LEAST_COSINE = 72, 0.07, 2.0, 0.25
-MODEL = make_textured_model()
+MODEL = cases.make_textured_model()
 SPACE = texture_space(MODEL, 128)
 K = torch.tensor([[110.0, 0, 36.5], [0, 108.0, 35.5], [0, 0, 1]])
 CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1, -1, 1])), SIDE, SIDE)
@@ -263,14 +257,14 @@ def reference(seen: SurfaceView, skin: SkinTexture) -> tuple[Tensor, Tensor, Ten
 
 LIGHT = even_light()
 LIGHT[1:4] = torch.tensor([[0.5, 0.4, 0.3], [0.6, 0.6, 0.7], [-0.4, -0.3, 0.2]])
-SKIN = SkinTexture(smooth_noise(128, 128, 3.0), (SPACE.fragments.face_index >= 0).float(), SIGMA)
+SKIN = SkinTexture(cases.smooth_noise(128, 128, 3.0), (SPACE.fragments.face_index >= 0).float(), SIGMA)
 
 
 def test_cost_gradient_and_hessian_are_those_of_the_pixels():
     mask = torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(4)).clamp_min(0.2)
     mask[:, :20] = 0
     jacobian = torch.randn(len(MODEL.template), 3, 5, generator=torch.Generator().manual_seed(2))
-    seen = SurfaceView(posed(jacobian=jacobian), Picture(CAMERA, smooth_noise(SIDE, SIDE, 2.0, 5), mask), LIGHT)
+    seen = SurfaceView(posed(jacobian=jacobian), Picture(CAMERA, cases.smooth_noise(SIDE, SIDE, 2.0, 5), mask), LIGHT)
     gradient, hessian, residual = torch.empty(5), torch.empty(5, 5), torch.empty(SIDE, SIDE, 3)
     surface = _native.AlignSurface(
         SPACE.faces, SPACE.corners, SPACE.used.to(torch.uint8), SKIN.albedo, SKIN.trust, SIGMA, OUTLIER, LEAST_COSINE

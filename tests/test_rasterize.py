@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+import rasterize_scenes as splats
 from instruction_sets import ISAS
 from known import known
 from mien import _native
@@ -22,20 +23,10 @@ from mien.render import rasterize as rasterize_in_place
 from mien.render.rasterize import Backend, choose_backend
 from mien.render.validation import drawable
 from needs import use_instructions
-from rasterize_scenes import (
-    GSPLAT,
-    Scene,
-    assert_matches_reference,
-    gradients,
-    leaves,
-    random_scene,
-    rasterize_anywhere,
-    render,
-)
 from rasterize_scenes import rasterize_anywhere as rasterize
 from refusals import refuses
 
-BACKENDS = ["native", GSPLAT]
+BACKENDS = ["native", splats.GSPLAT]
 
 
 @pytest.fixture(autouse=True)
@@ -45,49 +36,49 @@ def restore_native_settings() -> Iterator[None]:
     _native.set_rasterize_isa(before)
 
 
-def scenes(backend: Backend) -> Iterator[Scene]:
+def scenes(backend: Backend) -> Iterator[splats.Scene]:
     """Scenes of any size and number of Gaussians, and odd ones."""
     for width, height in ((1, 1), (3, 70), (32, 32), (129, 65)):
-        yield random_scene(width + height, count=150, width=width, height=height)
+        yield splats.random_scene(width + height, count=150, width=width, height=height)
     for count in (1, 15, 16, 17, 1000):
-        yield random_scene(count, count=count)
+        yield splats.random_scene(count, count=count)
     # Pixels end early under many opaque layers, when transmittance runs out, and alpha is clamped at 0.999.
-    ended = random_scene(5, count=600, width=40, height=40)
+    ended = splats.random_scene(5, count=600, width=40, height=40)
     ended.gaussians.scales.mul_(4)
     ended.gaussians.opacities.clamp_(min=0.9).mul_(1.2).clamp_(max=1.0)
     yield ended
-    large = random_scene(6, count=30, width=150, height=140)  # larger than the picture
+    large = splats.random_scene(6, count=30, width=150, height=140)  # larger than the picture
     large.gaussians.scales.mul_(20)
     large.gaussians.opacities.mul_(0.2)
     yield large
     # The covariance's determinant cancels if it is computed carelessly. gsplat computes it so. On an H100, its alpha
     # errs by 8e-6 for needles of 0.1 m, by 2.6e-4 for those of 0.5 m.
-    needles = random_scene(7, count=60, width=100, height=100)
+    needles = splats.random_scene(7, count=60, width=100, height=100)
     needles.gaussians.scales.copy_(torch.tensor([0.1 if backend == "gsplat" else 0.5, 1e-4, 1e-4]))
     yield needles
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-@pytest.mark.parametrize("level", [*ISAS, GSPLAT])
+@pytest.mark.parametrize("level", [*ISAS, splats.GSPLAT])
 def test_every_level_matches_the_reference(coefficients: int, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if level != "gsplat":
         use_instructions(level)
     backend = "gsplat" if level == "gsplat" else "native"
-    assert_matches_reference(random_scene(coefficients, coefficients=coefficients), monkeypatch, backend)
+    splats.assert_matches_reference(splats.random_scene(coefficients, coefficients=coefficients), monkeypatch, backend)
 
 
 @pytest.mark.unchecked
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_any_size_number_and_shape_matches_the_reference(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     for scene in scenes(backend):
-        assert_matches_reference(scene, monkeypatch, backend)
+        splats.assert_matches_reference(scene, monkeypatch, backend)
 
 
 def test_several_forwards_before_their_backwards() -> None:
-    scenes = [random_scene(seed, count=100 + 50 * seed) for seed in range(6)]
-    expected = [gradients(scene, "native", lambda r: (r.image**2).sum())[1]["means"] for scene in scenes]
-    tensors = [leaves(scene) for scene in scenes]
-    renderings = [render(scene, own, "native") for scene, own in zip(scenes, tensors, strict=True)]
+    scenes = [splats.random_scene(seed, count=100 + 50 * seed) for seed in range(6)]
+    expected = [splats.gradients(scene, "native", lambda r: (r.image**2).sum())[1]["means"] for scene in scenes]
+    tensors = [splats.leaves(scene) for scene in scenes]
+    renderings = [splats.render(scene, own, "native") for scene, own in zip(scenes, tensors, strict=True)]
     for index in (3, 0, 5, 1, 4, 2):
         (renderings[index].image ** 2).sum().backward()
     assert all(torch.equal(known(own["means"].grad), value) for own, value in zip(tensors, expected, strict=True))
@@ -95,19 +86,19 @@ def test_several_forwards_before_their_backwards() -> None:
 
 @pytest.mark.unchecked
 def test_reference_gradients_match_finite_differences() -> None:
-    scene = random_scene(1, count=4, coefficients=4, width=9, height=7).to(torch.float64)
+    scene = splats.random_scene(1, count=4, coefficients=4, width=9, height=7).to(torch.float64)
     scene.gaussians.scales.mul_(8)  # every alpha stays far from its cutoff
     scene.gaussians.means.mul_(0.3)  # within the margin where the Jacobian is not clamped: its bounds count as constant
-    tensors = leaves(scene)
+    tensors = splats.leaves(scene)
 
     def rgba(*values: Tensor) -> Tensor:
-        rendering = render(scene, dict(zip(tensors, values, strict=True)), "reference")
+        rendering = splats.render(scene, dict(zip(tensors, values, strict=True)), "reference")
         return torch.cat([rendering.image, rendering.alpha[..., None]], -1)
 
     assert torch.autograd.gradcheck(rgba, tuple(tensors.values()), eps=1e-6, atol=1e-6, rtol=1e-4)
 
 
-@pytest.mark.parametrize("backend", ["reference", "native", GSPLAT])
+@pytest.mark.parametrize("backend", ["reference", "native", splats.GSPLAT])
 def test_tiny_case_matches_the_picture_that_gsplat_made(test_data: Path, backend: Backend) -> None:
     stored = load_file(test_data / "golden" / "tiny_case.safetensors")
     viewmat = torch.eye(4)
@@ -116,13 +107,13 @@ def test_tiny_case_matches_the_picture_that_gsplat_made(test_data: Path, backend
     gaussians = Gaussians(
         stored["means"], stored["quats"], stored["scales"].exp(), stored["opacities"].sigmoid(), stored["coeffs"]
     )
-    rendering = rasterize_anywhere(gaussians, camera, torch.zeros(3), backend=backend)
+    rendering = splats.rasterize_anywhere(gaussians, camera, torch.zeros(3), backend=backend)
     picture = torch.cat([rendering.image, rendering.alpha[..., None]], -1)
     # Measured 1e-6: the same arithmetic in another order; 1e-4 would show a wrong constant (dilation, cutoff, clamp).
     torch.testing.assert_close(picture, stored["out_img"], rtol=0, atol=1e-5)
 
 
-ALL_BACKENDS = ["native", "reference", GSPLAT]
+ALL_BACKENDS = ["native", "reference", splats.GSPLAT]
 
 
 def one_gaussian(depth: float = 1.0, opacity: float = 0.8, scale: float = 0.02) -> Gaussians:
@@ -139,7 +130,7 @@ def front_camera(width: int = 21, height: int = 15) -> Camera:
     return Camera(K, torch.eye(4), width, height)
 
 
-def stacked(scenes: list[Scene]) -> Gaussians:
+def stacked(scenes: list[splats.Scene]) -> Gaussians:
     names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
     return Gaussians(**{name: torch.stack([getattr(s.gaussians, name) for s in scenes]) for name in names})
 
@@ -167,7 +158,7 @@ def test_balls_on_the_axis_show_their_colors_at_the_center(backend: Backend) -> 
 
 @pytest.mark.parametrize("backend", ALL_BACKENDS)
 def test_batches_equal_their_single_pictures(backend: Backend) -> None:
-    scenes = [random_scene(seed, count=50) for seed in range(3)]
+    scenes = [splats.random_scene(seed, count=50) for seed in range(3)]
     cameras, background = [scene.camera for scene in scenes], scenes[0].background
     singles = [rasterize(s.gaussians, s.camera, background, backend) for s in scenes]
     batch = rasterize(stacked(scenes), cameras, background, backend)
@@ -222,10 +213,10 @@ def test_nothing_to_see_is_background(backend: Backend) -> None:
 
 @pytest.mark.parametrize("backend", ALL_BACKENDS)
 def test_what_is_not_finite_is_named(backend: Backend) -> None:
-    camera = random_scene(3).camera
+    camera = splats.random_scene(3).camera
     for name in ("means", "quats", "scales", "opacities", "sh"):
         for value in (torch.nan, torch.inf, -torch.inf):
-            gaussians = random_scene(3, count=40).gaussians
+            gaussians = splats.random_scene(3, count=40).gaussians
             gaussians.means[17] = torch.tensor([0.0, 0.0, 0.2])  # in view, since the kernel reads no other colours
             gaussians.opacities[17] = 0.5
             getattr(gaussians, name).view(40, -1)[17, -1] = value
@@ -242,7 +233,7 @@ def test_what_is_not_finite_is_named(backend: Backend) -> None:
 
 
 def test_layouts_and_dtypes() -> None:
-    scene = random_scene(4)
+    scene = splats.random_scene(4)
     spread = {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     spread = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in spread.items()}
     assert not spread["means"].is_contiguous()
@@ -258,13 +249,13 @@ def test_layouts_and_dtypes() -> None:
 
 
 def test_what_does_not_fit_or_cannot_be_counted_is_refused() -> None:
-    scenes = [random_scene(seed) for seed in range(3)]
+    scenes = [splats.random_scene(seed) for seed in range(3)]
     one, cameras = scenes[0].gaussians, [scene.camera for scene in scenes]
     for gaussians, given, words in (
         (stacked(scenes), cameras[:2], "3 timesteps of Gaussians but 2 cameras"),
         (one, [cameras[0], front_camera()], "must have one size"),
         (one, [], "is empty"),
-        (random_scene(0, coefficients=5).gaussians, cameras[0], "sh has shape"),
+        (splats.random_scene(0, coefficients=5).gaussians, cameras[0], "sh has shape"),
     ):
         with pytest.raises(ValueError, match=words):
             rasterize(gaussians, given, torch.zeros(3))
@@ -285,7 +276,7 @@ def _render_in_child(queue: "multiprocessing.Queue[list[float]]") -> None:
 def test_a_forked_child_renders() -> None:
     """Threads do not survive a fork, so the pool must notice it."""
     _native.set_thread_count(2)
-    scene = random_scene(0)
+    scene = splats.random_scene(0)
     expected = rasterize(one_gaussian(), front_camera(), torch.zeros(3), "native").image[7, 10].tolist()
     rasterize(scene.gaussians, scene.camera, scene.background, "native")
     context = multiprocessing.get_context("fork")

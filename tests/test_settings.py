@@ -117,14 +117,11 @@ def test_options_reach_every_depth_and_win_over_the_file_and_the_file_over_the_p
         ("--preset paper --steps 30", other, (replace(paper, sh_degree=2), replace(OPEN, steps=30, seed=4))),
         ("--preset paper --method.sh-degree 1", other, (replace(paper, sh_degree=1), replace(OPEN, steps=700, seed=4))),
         ("--hold-out", file, (config, run)),
-        (
-            "--hold-out --method.features 8 --steps 50 --preset draft --seed 0",
-            file,
-            (replace(config, features=8), replace(run, steps=50, seed=0)),
-        ),
+        ("--hold-out --method.features 8 --steps 50 --preset draft --seed 0", file,
+         (replace(config, features=8), replace(run, steps=50, seed=0))),
         ("--method headgas", {"settings": {"seed": 1}}, (HeadGasConfig(), replace(RUN, seed=1))),
         ("", {}, choices("")),
-    ):
+    ):  # fmt: skip
         assert choices(line, given) == expected
     assert choices("--preset draft", {"settings": {"split": "tail"}})[1] == replace(RUN, steps=4000, split="tail")
 

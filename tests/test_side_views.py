@@ -32,16 +32,8 @@ from mien.tracking.scoring import head_cutter
 from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import Frame
 from mien.training.settings import resolved
+from mien.training.whole_head import soft_cut
 from mien.training.whole_head.side_views import SideView, SideViews, side_views, turned_to_side
-from mien.training.whole_head.soft_cut import (
-    SOFT_CUT_COLLAR,
-    SOFT_CUT_HEAD,
-    SOFT_CUT_LEAST,
-    SOFT_CUT_OFF_SKIN,
-    SOFT_CUT_WIDTH,
-    opacity_shares,
-    with_soft_cut,
-)
 from mien.training.whole_head.unseen import fills_sides
 from plain_settings import plain_gaussian_avatars
 from shared_things import MadeOnce, toy_workspace
@@ -128,12 +120,12 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     avatar = GaussianAvatars(plain_gaussian_avatars(expression_rank=2, expression_weight=3.0), anny, face)
     avatar.store.assign("offset_basis", torch.ones_like(avatar.store["offset_basis"]))
     avatar.activations.directions.fill_(1.0)
-    avatar.activations.seen = torch.full((1, 2), 0.5**0.5)
+    avatar.activations.seen = torch.ones_like(avatar.activations.seen[:1])
     views = replace(_views(anny), weight=0.0)
     turned, raised = (_loss(views, avatar, face, step).detach() for step in (0, 4))
     assert float(turned) == 0
-    # The random numbers raise coefficients until the activations, 2 alike, have the length that they approach.
-    assert 0 < float(raised) <= 8 * 3 * 2 * 1.1**2
+    # The random numbers raise coefficients until activations have the length that they approach.
+    assert 0 < float(raised) <= 8 * 3 * 1.1**2
     surface = known(avatar.extras.surface)
     hair = ~views.compared[surface.triangles()]
     assert 0.1 < float(hair.float().mean()) < 0.9
@@ -209,22 +201,22 @@ def opacities(portable: runtime.PortableAvatar) -> np.ndarray:
 
 def test_what_is_far_from_the_cut_stays_and_the_end_of_the_neck_is_clear(model, avatar) -> None:
     before = make_portable(avatar, toy_camera(64), "soft")
-    after = with_soft_cut(before, avatar)
+    after = soft_cut.with_soft_cut(before, avatar)
     assert isinstance(before.baked, MeshBound)
     neck = model.region_mask("neck").numpy()[before.baked.face_index]
     was, now = opacities(before), opacities(after)
     np.testing.assert_array_equal(now[~neck], was[~neck])
     cut = cut_of(model, model(avatar.subject)[0])
     margins = cut.margins(world_means(avatar.pose(avatar.subject).gaussians.timestep(0)).detach()).numpy()
-    between = (margins > 0) & (margins < SOFT_CUT_WIDTH) & neck
-    far = neck & (margins < -SOFT_CUT_HEAD[1])
+    between = (margins > 0) & (margins < soft_cut.SOFT_CUT_WIDTH) & neck
+    far = neck & (margins < -soft_cut.SOFT_CUT_HEAD[1])
     assert far.any()
-    assert (now[far] <= 1.01 * SOFT_CUT_LEAST).all()
+    assert (now[far] <= 1.01 * soft_cut.SOFT_CUT_LEAST).all()
     assert (now[between] <= was[between]).all()
     assert (now[between] < 0.9 * was[between]).any()
     # Pictures end as softly as files.
     soft, sharp = posed_softly(avatar)(avatar.subject), avatar.pose(avatar.subject).gaussians.timestep(0)
-    np.testing.assert_allclose(soft.opacities.numpy(), now, atol=SOFT_CUT_LEAST + 1e-6)
+    np.testing.assert_allclose(soft.opacities.numpy(), now, atol=soft_cut.SOFT_CUT_LEAST + 1e-6)
     assert torch.equal(soft.means, sharp.means)
     assert float((soft.opacities / sharp.opacities.detach()).min()) < 0.01
 
@@ -234,14 +226,14 @@ def test_shares_grow_with_the_distance_from_the_cut(model: FaceModel) -> None:
     cut = cut_of(model)
     origin, side, up = (torch.from_numpy(each).float() for each in (cut.origin, cut.axes[0], cut.axes[2]))
     points, far = origin + torch.linspace(-0.02, 0.05, 15)[:, None] * up, torch.full((1, 3), 10.0)
-    shares = opacity_shares(points, cut, far, points)
+    shares = soft_cut.opacity_shares(points, cut, far, points)
     assert (shares.diff() >= 0).all()
     assert (float(shares[0]), float(shares[-1])) == (0.0, 1.0)
     assert ((shares > 0.1) & (shares < 0.9)).any()
-    assert (opacity_shares(points, cut, points, points) == 1).all(), "what lies on the head is not cut off"
-    gap, (low, high) = SOFT_CUT_OFF_SKIN[1] + 1e-3, SOFT_CUT_COLLAR
+    assert (soft_cut.opacity_shares(points, cut, points, points) == 1).all(), "what lies on the head is not cut off"
+    gap, (low, high) = soft_cut.SOFT_CUT_OFF_SKIN[1] + 1e-3, soft_cut.SOFT_CUT_COLLAR
     skin = origin + torch.tensor([0.95 * low, 1.1 * high])[:, None] * up
-    on_skin, off_skin = (opacity_shares(skin + away * side, cut, far, skin) for away in (0.0, gap))
+    on_skin, off_skin = (soft_cut.opacity_shares(skin + away * side, cut, far, skin) for away in (0.0, gap))
     assert (on_skin > 0.7).all()
     assert off_skin[0] == 0
     assert off_skin[1] == on_skin[1] == 1

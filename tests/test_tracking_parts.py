@@ -5,18 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mien.tracking.fitting import solver
 from mien.tracking.fitting.fit import Fit, SequenceFit, Subject, smoothness_of
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.sequence import sequence_data
-from mien.tracking.fitting.solver import (
-    Bounds,
-    NormalEquations,
-    SharedEquations,
-    Smoothness,
-    minimize_frames,
-    solve_arrow,
-    solve_chain,
-)
 from mien.tracking.fitting.views import batch_of
 from mien.tracking.landmarks import groups
 from mien.tracking.landmarks.model import reduce_face_model
@@ -97,10 +89,10 @@ def test_bounded_least_squares():
         return ((state - target) @ metric * (state - target)).sum(1)
 
     def equations(state):
-        return NormalEquations(cost(state), (state - target) @ metric, metric.expand(2, 2, 2))
+        return solver.NormalEquations(cost(state), (state - target) @ metric, metric.expand(2, 2, 2))
 
-    box = Bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
-    found = minimize_frames(equations, cost, torch.full((2, 2), 0.5, dtype=torch.float64), box, 30)
+    box = solver.Bounds(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
+    found = solver.minimize_frames(equations, cost, torch.full((2, 2), 0.5, dtype=torch.float64), box, 30)
     assert found[:, 0].tolist() == [1, 0]
     # With x clamped, y minimises on: y = target_y - (0.9 / 1.0) (x - target_x), clamped as well.
     torch.testing.assert_close(found, torch.tensor([[1.0, 1.0], [0.0, 0.0]], dtype=torch.float64))
@@ -114,10 +106,10 @@ def test_chain_solver_matches_the_dense_solution(timesteps):
     gradient, state = torch.randn(2, timesteps, p, generator=random, dtype=torch.float64)
     linked = torch.ones(timesteps, dtype=torch.bool)
     linked[[0, -1]] = False
-    smoothness = Smoothness(torch.tensor([0.0, 1.0, 30.0], dtype=torch.float64), linked)
+    smoothness = solver.Smoothness(torch.tensor([0.0, 1.0, 30.0], dtype=torch.float64), linked)
     held = torch.zeros(timesteps, p, dtype=torch.bool)
     held[1, 2] = True
-    step = solve_chain(NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
+    step = solver.solve_chain(solver.NormalEquations(gradient[:, 0], gradient, hessian), smoothness, state, held)
     weights, second = smoothness.weights(state), torch.zeros(timesteps, timesteps, dtype=torch.float64)
     for t in range(1, timesteps - 1):
         second[t, t - 1 : t + 2] = torch.tensor([1.0, -2.0, 1.0])
@@ -139,10 +131,10 @@ def test_frames_and_what_they_share_are_solved_as_one_dense_system():
     dense, gradient = root @ root.T + torch.eye(8), torch.randn(8, generator=random, dtype=torch.float64)
     dense[:3, 3:6] = dense[3:6, :3] = 0
     own = torch.stack([dense[:3, :3], dense[3:6, 3:6]])
-    frames = NormalEquations(torch.zeros(2), gradient[:6].reshape(2, 3), own)
-    shared = SharedEquations(dense[:6, 6:].reshape(2, 3, 2), dense[6:, 6:], gradient[6:])
+    frames = solver.NormalEquations(torch.zeros(2), gradient[:6].reshape(2, 3), own)
+    shared = solver.SharedEquations(dense[:6, 6:].reshape(2, 3, 2), dense[6:, 6:], gradient[6:])
     held = torch.tensor([[False, False, True], [False, False, False]])
-    steps = solve_arrow(frames, shared, held, damping)
+    steps = solver.solve_arrow(frames, shared, held, damping)
     moving, expected = torch.cat([~held.flatten(), torch.ones(2, dtype=torch.bool)]), torch.zeros(8).double()
     damped = dense + torch.diag(damping * dense.diagonal())
     expected[moving] = -torch.linalg.solve(damped[moving][:, moving], gradient[moving])

@@ -13,18 +13,11 @@ from damage import edit_json
 from mien.camera import look_at
 from mien.disk.files import read_json, read_tensors, write_tensors
 from mien.errors import UserError
-from mien.tracking import read_tracking, write_tracking
+from mien.tracking import read_tracking, scoring_files, write_tracking
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
 from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
 from mien.tracking.report.overlay import OverlayPainter, write_overlay
 from mien.tracking.scoring import Scoring, cut_matte, head_crop, make_scoring
-from mien.tracking.scoring_files import (
-    check_scoring_cut,
-    read_scoring,
-    read_scoring_hash,
-    scoring_exists,
-    write_scoring,
-)
 from mien.tracking.settings import ScoringSettings
 from mien.tracking.tracking import Appearance, Tracking
 from refusals import refuses
@@ -229,37 +222,37 @@ def test_scoring_round_trip_and_frozen(tmp_path):
     """The hash of a scoring covers masks and crops. Figures of other runs name it, so it must not change."""
     folder = tmp_path / "scoring"
     (folder / "masks").mkdir(parents=True)
-    assert not scoring_exists(folder), "half written"
-    write_scoring(folder, _scoring(), "a1")
-    assert scoring_exists(folder)
-    again = read_scoring(folder)
+    assert not scoring_files.scoring_exists(folder), "half written"
+    scoring_files.write_scoring(folder, _scoring(), "a1")
+    assert scoring_files.scoring_exists(folder)
+    again = scoring_files.read_scoring(folder)
     np.testing.assert_array_equal(again.masks, _scoring().masks)
     np.testing.assert_array_equal(again.crops, _scoring().crops)
     digest = hashlib.sha256(_scoring().masks.tobytes() + _scoring().crops.astype(np.int32).tobytes()).hexdigest()
-    assert read_scoring_hash(folder) == digest
+    assert scoring_files.read_scoring_hash(folder) == digest
     before = tree_bytes(folder)
-    write_scoring(folder, _scoring(value=100), "a1")
+    scoring_files.write_scoring(folder, _scoring(value=100), "a1")
     assert tree_bytes(folder) == before
     assert list(tmp_path.iterdir()) == [folder], "no scratch folder stays behind"
 
 
 def test_masks_keep_their_cut(tmp_path):
     folder = tmp_path / "scoring"
-    check_scoring_cut(folder, ScoringSettings("line"), "a1")
-    write_scoring(folder, replace(_scoring(), cut="line"), "a1")
+    scoring_files.check_scoring_cut(folder, ScoringSettings("line"), "a1")
+    scoring_files.write_scoring(folder, replace(_scoring(), cut="line"), "a1")
     assert read_json(folder / "scoring.json", "mien.scoring", 1, "")["cut"] == "line"
-    assert read_scoring(folder).cut == "line"
-    check_scoring_cut(folder, ScoringSettings("line"), "a1")
-    check_scoring_cut(folder, ScoringSettings("plane"), "b2")  # masks of other pictures are made again
+    assert scoring_files.read_scoring(folder).cut == "line"
+    scoring_files.check_scoring_cut(folder, ScoringSettings("line"), "a1")
+    scoring_files.check_scoring_cut(folder, ScoringSettings("plane"), "b2")  # masks of other pictures are made again
     with pytest.raises(UserError, match=r"--scoring.cut plane: .*give --scoring.cut line, or delete that folder"):
-        check_scoring_cut(folder, ScoringSettings("plane"), "a1")
+        scoring_files.check_scoring_cut(folder, ScoringSettings("plane"), "a1")
     edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
-    refuses(r"cut 'circle' is neither plane nor line; delete the folder", read_scoring, folder)
+    refuses(r"cut 'circle' is neither plane nor line; delete the folder", scoring_files.read_scoring, folder)
 
 
 def test_damaged_scoring(tmp_path):
-    write_scoring(tmp_path / "s", _scoring(), "a1")
-    write_scoring(tmp_path / "other", _scoring(value=100), "a1")
+    scoring_files.write_scoring(tmp_path / "s", _scoring(), "a1")
+    scoring_files.write_scoring(tmp_path / "other", _scoring(value=100), "a1")
     mask, other = (tmp_path / name / "masks/00/000001.png" for name in ("s", "other"))
     for content, refusal in (
         (mask.read_bytes()[:-5], "damaged"), (None, "missing"),
@@ -268,5 +261,5 @@ def test_damaged_scoring(tmp_path):
         mask.unlink()
         if content:
             mask.write_bytes(content)
-        refuses(refusal, read_scoring, tmp_path / "s")
+        refuses(refusal, scoring_files.read_scoring, tmp_path / "s")
         mask.touch()

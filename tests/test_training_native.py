@@ -19,25 +19,12 @@ from mien.avatar.avatar import ParameterGroup
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.expression_changes import expression_change, expression_change_reference
 from mien.avatar.ops.skin_points import skin_points, skin_points_reference
-from mien.avatar.ops.surface_limits import (
-    keep_on_surface,
-    keep_on_surface_reference,
-    limits_of_triangles,
-    pull_colors,
-)
+from mien.avatar.ops.surface_limits import keep_on_surface, keep_on_surface_reference, limits_of_triangles, pull_colors
 from mien.avatar.ops.triangle_frames import bind_to_world
 from mien.avatar.ops.triangle_penalties import triangle_penalties, triangle_penalties_reference
 from mien.avatar.settings import Progress, Rate
 from mien.avatar.store import GaussianStore, Moments
-from mien.training.adam import (
-    Adam,
-    FactoredUpdate,
-    Update,
-    factored_update,
-    factored_update_reference,
-    update_all,
-    update_reference,
-)
+from mien.training import adam as updates
 from mien.training.density_control.gradient import observe_reference
 from mien.training.losses import alpha_loss, alpha_loss_reference
 from toy_scene import random
@@ -79,12 +66,12 @@ class Kernel:
 
 
 def adam(given: Tensors, native: bool) -> Tensors:
-    def update() -> Update:
+    def update() -> updates.Update:
         first, second, values, gradient = (tensor.clone() for tensor in given)
-        return Update(values, gradient, Moments(first, second, torch.tensor(3.0)), 0.01)
+        return updates.Update(values, gradient, Moments(first, second, torch.tensor(3.0)), 0.01)
 
     one = update()
-    update_all([one, update()]) if native else update_reference(one)
+    updates.update_all([one, update()]) if native else updates.update_reference(one)
     return [one.values, one.moments.first, one.moments.second, one.moments.step]
 
 
@@ -158,9 +145,9 @@ def terms_of(given: Tensors) -> list[FactoredTerm]:
 def factored(given: Tensors, native: bool) -> Tensors:
     values, second, weights, *terms = (tensor.clone() for tensor in given)
     moments = FactoredMoments(second, weights)
-    update = FactoredUpdate(values, terms_of(terms), moments, 0.01)
+    update = updates.FactoredUpdate(values, terms_of(terms), moments, 0.01)
     for one in (update._replace(rate=0.0), update, update, update):
-        (factored_update if native else factored_update_reference)(one)
+        (updates.factored_update if native else updates.factored_update_reference)(one)
     return [values, second, weights]
 
 
@@ -174,7 +161,7 @@ def published(given: Tensors, native: bool) -> Tensors:
     """Adam as published, by factors. The reference is another dtype."""
     values, first, second, *terms = (tensor.clone() for tensor in given)
     moments = Moments(first, second, torch.tensor(3.0))
-    factored_update(FactoredUpdate(values, terms_of(terms), moments, 0.01))
+    updates.factored_update(updates.FactoredUpdate(values, terms_of(terms), moments, 0.01))
     return [values, first, second, moments.step]
 
 
@@ -340,11 +327,13 @@ def test_adam_takes_another_epsilon_and_what_is_not_dense_by_the_reference() -> 
     """The core has one epsilon. An update with another is made in PyTorch, and is as small as the formula says."""
     for epsilon, moved in ((1e-15, 0.1), (1e-8, 0.1 / 11), (1e-9, 0.05)):
         values = torch.zeros(4, 3)
-        update_all([Update(values, torch.full((1, 3), 1e-9).expand(4, 3), Moments.zeros(values), 0.1, epsilon)])
+        updates.update_all(
+            [updates.Update(values, torch.full((1, 3), 1e-9).expand(4, 3), Moments.zeros(values), 0.1, epsilon)]
+        )
         torch.testing.assert_close(values, torch.full((4, 3), -moved), rtol=1e-4, atol=0)
         of_a_group = torch.zeros(4, 3, requires_grad=True)
         of_a_group.grad = torch.full((4, 3), 1e-9)
-        Adam().step([ParameterGroup("one", {"one": of_a_group}, Rate(0.1), epsilon=epsilon)], Progress(0, 1))
+        updates.Adam().step([ParameterGroup("one", {"one": of_a_group}, Rate(0.1), epsilon=epsilon)], Progress(0, 1))
         torch.testing.assert_close(of_a_group.detach(), values, rtol=1e-4, atol=0)
 
 

@@ -19,15 +19,7 @@ from mien.gaussians import Rendering
 from mien.training import train
 from mien.training.adam import Adam
 from mien.training.batch import AHEAD, targets_ahead
-from mien.training.footage.frames import (
-    DENSITY,
-    FrameOrder,
-    background_at,
-    expression_rarity,
-    held_out,
-    random_at,
-    training_frames,
-)
+from mien.training.footage import frames as footage
 from mien.training.footage.sequence import Sequence, Target, Targets, composite
 from mien.training.losses import photometric_loss, picture_losses
 from mien.training.settings import Split
@@ -48,7 +40,7 @@ from train_toy import stopped_at
     (101, "none", []),
 ])  # fmt: skip
 def test_splits(timesteps: int, split: Split, expected: list[int]) -> None:
-    assert held_out(timesteps, split).nonzero()[:, 0].tolist() == expected
+    assert footage.held_out(timesteps, split).nonzero()[:, 0].tolist() == expected
 
 
 def test_frames_leave_out_what_is_invalid_or_held_out_which_has_to_be_there() -> None:
@@ -56,10 +48,10 @@ def test_frames_leave_out_what_is_invalid_or_held_out_which_has_to_be_there() ->
     valid = np.ones((60, 1), dtype=bool)
     valid[3] = False
     second = replace(sequence, name="other", capture=replace(sequence.capture, valid=valid))
-    frames = training_frames([sequence, second], plain_run(split="blocks"))
+    frames = footage.training_frames([sequence, second], plain_run(split="blocks"))
     assert len(frames) == 50 + 49
     assert {frame.timestep for frame in frames if frame.sequence == 1} == set(range(60)) - {3} - set(range(40, 50))
-    only = training_frames([sequence, second], plain_run(split="none", held_out_sequences=("toy",)))
+    only = footage.training_frames([sequence, second], plain_run(split="none", held_out_sequences=("toy",)))
     assert {frame.sequence for frame in only} == {1}
     _, sequence = toy_sequence(12, 16)
     for settings, words in (
@@ -68,7 +60,7 @@ def test_frames_leave_out_what_is_invalid_or_held_out_which_has_to_be_there() ->
         (plain_run(held_out_sequences=("toy",)), "leaves no sequence to train on"),
         (plain_run(held_out_cameras=("front",)), "no frame is left to train on"),
     ):
-        refuses(words, training_frames, [sequence], settings)
+        refuses(words, footage.training_frames, [sequence], settings)
 
 
 def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
@@ -82,14 +74,14 @@ def test_calibrated_cameras_train_also_where_they_find_no_face() -> None:
     seen = replace(tracking, valid=torch.tensor([True] * 5 + [False]), cameras=tracking.cameras * 2)
     ring = replace(sequence, capture=both, tracking=seen, scoring=sequence.scoring.repeat(2, 1))
     for held_out_cameras, cameras in (((), (0, 1)), (("back",), (0,))):
-        frames = training_frames([ring], plain_run(split="none", held_out_cameras=held_out_cameras))
+        frames = footage.training_frames([ring], plain_run(split="none", held_out_cameras=held_out_cameras))
         assert [(frame.timestep, frame.camera) for frame in frames] == [(t, c) for t in range(5) for c in cameras]
 
 
 def test_order_backgrounds_and_density_draws_depend_on_seed_and_step_only() -> None:
-    frames = training_frames([toy_sequence(12, 16)[1]], plain_run(split="none"))
+    frames = footage.training_frames([toy_sequence(12, 16)[1]], plain_run(split="none"))
     first, second, other = (
-        [FrameOrder(frames, seed).at(step) for step in range(start, start + 12)]
+        [footage.FrameOrder(frames, seed).at(step) for step in range(start, start + 12)]
         for seed, start in ((5, 0), (5, 12), (6, 0))
     )
     for number, one in enumerate((first, second)):
@@ -98,13 +90,13 @@ def test_order_backgrounds_and_density_draws_depend_on_seed_and_step_only() -> N
     assert [frame for frame, _ in first] != [frame for frame, _ in second]
     assert first != other
     settings = plain_run(background="random", seed=1)
-    assert background_at(settings, 3).tolist() != background_at(settings, 4).tolist()
-    assert background_at(plain_run(background="white"), 3).tolist() == [255, 255, 255]
-    mixed = [background_at(replace(settings, background="mixed"), step).tolist() for step in range(400)]
+    assert footage.background_at(settings, 3).tolist() != footage.background_at(settings, 4).tolist()
+    assert footage.background_at(plain_run(background="white"), 3).tolist() == [255, 255, 255]
+    mixed = [footage.background_at(replace(settings, background="mixed"), step).tolist() for step in range(400)]
     drawn = [step for step, color in enumerate(mixed) if color != [255, 255, 255]]
     assert 0.06 * 400 < len(drawn) < 0.14 * 400
-    assert all(mixed[step] == background_at(settings, step).tolist() for step in drawn)
-    draws = [torch.rand(4, generator=random_at(seed, DENSITY, 3)) for seed in (1, 1, 2)]
+    assert all(mixed[step] == footage.background_at(settings, step).tolist() for step in drawn)
+    draws = [torch.rand(4, generator=footage.random_at(seed, footage.DENSITY, 3)) for seed in (1, 1, 2)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
 
@@ -179,20 +171,20 @@ def test_frames_with_rare_expressions_come_more_often() -> None:
         face = replace(sequence.tracking.face, expression=expression)
         return replace(sequence, tracking=replace(sequence.tracking, face=face))
 
-    frames = training_frames([sequence], plain_run(split="none"))
-    weights = expression_rarity([tracked(expression)], frames)
+    frames = footage.training_frames([sequence], plain_run(split="none"))
+    weights = footage.expression_rarity([tracked(expression)], frames)
     assert float(weights.min()) >= 0.5
     assert float(weights[90:].min()) == float(weights.max()) == 2
     assert float(weights[:90].median()) < 1.2
-    order = FrameOrder(frames, 5, weights)
+    order = footage.FrameOrder(frames, 5, weights)
     seen = [order.at(step)[0].timestep for step in range(1000)]
     expected = (weights / weights.sum() * 1000).numpy()
     assert np.abs(np.bincount(seen, minlength=100) - expected).max() < 6, "ten passes, each rounded by less than one"
-    assert FrameOrder(frames, 5, weights).at(777) == order.at(777), "a function of seed and step"
+    assert footage.FrameOrder(frames, 5, weights).at(777) == order.at(777), "a function of seed and step"
     assert seen[:100] != seen[100:200]
     # One expression only gives even weights.
-    assert len(set(expression_rarity([tracked(0 * expression)], frames).tolist())) == 1
-    assert expression_rarity([sequence], frames[:1]).isfinite().all()
+    assert len(set(footage.expression_rarity([tracked(0 * expression)], frames).tolist())) == 1
+    assert footage.expression_rarity([sequence], frames[:1]).isfinite().all()
 
 
 @pytest.mark.unchecked
@@ -246,14 +238,14 @@ def test_native_composite_rounds_every_integer() -> None:
 def test_the_queue_gives_the_targets_of_the_steps(resolution: int, background: str, monkeypatch) -> None:
     """No more targets wait than those of the next few steps."""
     sequence, settings, made = toy_sequence(6, 32)[1], replace(SETTINGS, background=background), []
-    order = FrameOrder(training_frames([sequence], settings), 0)
+    order = footage.FrameOrder(footage.training_frames([sequence], settings), 0)
     targets, alone = Targets(sequence, resolution), Targets(sequence, resolution)
     composed = targets.composed
     monkeypatch.setattr(targets, "composed", lambda *arguments: made.append(arguments) or composed(*arguments))
     with targets_ahead(order, lambda _: [targets], settings) as queue:
         for step in (*range(9), *range(30, 40), 3, 4):  # as a run that resumes, too
             found, (frame, _) = queue.target(step), order.at(step)
-            own = alone.target(frame.timestep, frame.camera, background_at(settings, step), keep=False)
+            own = alone.target(frame.timestep, frame.camera, footage.background_at(settings, step), keep=False)
             assert found.box == own.box
             for name in ("picture", "matte", "background"):
                 assert getattr(found, name).equal(getattr(own, name)), (step, name)
@@ -293,7 +285,7 @@ def test_the_pictures_of_a_long_capture_are_never_held_at_once(monkeypatch: pyte
     sequence = replace(sequence, capture=capture, scoring=mattes, tracking=replace(tracking, cameras=cameras))
     monkeypatch.setattr("mien.training.footage.sequence.CACHE_BYTES", 4 * MIB)
     settings = replace(SETTINGS, steps=80, background="white")
-    order, targets = FrameOrder(training_frames([sequence], settings), 0), Targets(sequence, 0)
+    order, targets = footage.FrameOrder(footage.training_frames([sequence], settings), 0), Targets(sequence, 0)
     with allocating_at_most(10 * MIB), targets_ahead(order, lambda _: [targets], settings) as queue:
         for step in range(settings.steps):
             queue.target(step)

@@ -115,7 +115,7 @@ def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     write_tensors(path, tensors | changed, {"format": "mien.checkpoint", "version": "1"})
     train_toy.main(tmp_path, STEPS)
     summary, curves = read_training_summary(tmp_path), read_curves(tmp_path)
-    assert summary["seconds"] >= round(before, 1) and summary["seconds"] - 1e6 < 1e6  # counted on, not anew and not twice
+    assert round(before, 1) <= summary["seconds"] < 2e6, "counted on, not anew and not twice"
     assert (summary["steps"], summary["peak_memory_mb"]) == (STEPS, 7e6)
     assert curves["step"].tolist() == list(range(3, STEPS + 1, 3))
     assert curves["step_ms"][:2].tolist() == tensors["curves.step_ms"].tolist()

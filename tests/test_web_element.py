@@ -11,27 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+import web_case as web
 from mien import runtime
 from mien.camera import camera_from_fov, look_at
 from mien.formats.glb import write_glb
 from mien.formats.page import write_packed
 from test_glb import mesh_model
-from web_case import (
-    WEB,
-    browse,
-    bundle,
-    drawn_head,
-    expect_usable,
-    likeness,
-    picture,
-    psnr,
-    rendered,
-    script,
-    served,
-    violations,
-)
 
-EXAMPLES = WEB / "examples"
+EXAMPLES = web.WEB / "examples"
 LOADED = """
 window.avatar = document.querySelector("mien-avatar");
 if (!avatar.viewer) await new Promise((done, fail) => {
@@ -64,7 +51,7 @@ avatar.expression = "jawOpen:0";
 @pytest.fixture(scope="module")
 def site(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = Path(shutil.copytree(built, tmp_path_factory.mktemp("site"), dirs_exist_ok=True))
-    write_packed(folder / "me.packed", drawn_head(2000, rank=2))
+    write_packed(folder / "me.packed", web.drawn_head(2000, rank=2))
     shutil.copy(EXAMPLES / "element.html", folder / "index.html")
     shutil.copy(EXAMPLES / "playground.html", folder)
     return folder
@@ -72,33 +59,35 @@ def site(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_element_shows_an_avatar(site: Path) -> None:
     steps = [
-        script(LOADED, STILL, SHOT),
-        script("avatar.expression = 'jawOpen:0.7, eyeBlinkLeft:1';", SHOT),
-        script("avatar.expression = '';", ONE_BY_ONE, SHOT),
-        script("avatar.setAttribute('yaw', '20');", SHOT),
-        *(script(f"avatar.setAttribute('yaw', '{yaw}');", AHEAD) for yaw in (0, 30, -30)),
-        script("avatar.style = 'width: 2000px; height: 1600px';", STILL, PIXELS),
+        web.script(LOADED, STILL, SHOT),
+        web.script("avatar.expression = 'jawOpen:0.7, eyeBlinkLeft:1';", SHOT),
+        web.script("avatar.expression = '';", ONE_BY_ONE, SHOT),
+        web.script("avatar.setAttribute('yaw', '20');", SHOT),
+        *(web.script(f"avatar.setAttribute('yaw', '{yaw}');", AHEAD) for yaw in (0, 30, -30)),
+        web.script("avatar.style = 'width: 2000px; height: 1600px';", STILL, PIXELS),
         "[...['role', 'aria-label'].map((name) => avatar.getAttribute(name)), avatar.setExpression('smirk', 1),"
         " avatar.viewer.canvas.tabIndex]",
-        script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone;"),
-        script(
+        web.script("avatar.remove(); const gone = avatar.viewer; document.body.append(avatar);", LOADED, "return gone"),
+        web.script(
             "const told = new Promise((done) => avatar.addEventListener('error', (event) => done(event.detail)));",
             "avatar.src = 'nobody.packed'; const said = await told, box = avatar.shadowRoot;",
             "const words = box.querySelector('p[part=error][role=alert]').textContent;",
             "return [said, words, box.querySelectorAll('canvas').length];",
         ),
     ]  # fmt: skip
-    with served(site) as address:
-        told = browse(f"{address}/index.html", steps, size=(500, 600))
+    with web.served(site) as address:
+        told = web.browse(f"{address}/index.html", steps, size=(500, 600))
     rest, open_, same, turned, ahead, left, right, pixels, facts, gone, error = told["results"]
     assert left - 0.2 > ahead > right + 0.2, "yaw goes to the left of the person, as for `mien render --yaw`"
-    head = drawn_head(2000, rank=2)
-    shut, wide = (rendered(head, face, 320)[0] for face in ({"jawOpen": 0.0}, {"jawOpen": 0.7, "eyeBlinkLeft": 1.0}))
-    np.testing.assert_array_equal(picture(open_), picture(same))
-    assert likeness(rest, shut) >= 45
-    assert likeness(open_, wide) >= 45
-    assert psnr(shut, wide) < 40
-    assert likeness(turned, wide) < 30
+    head = web.drawn_head(2000, rank=2)
+    shut, wide = (
+        web.rendered(head, face, 320)[0] for face in ({"jawOpen": 0.0}, {"jawOpen": 0.7, "eyeBlinkLeft": 1.0})
+    )
+    np.testing.assert_array_equal(web.picture(open_), web.picture(same))
+    assert web.likeness(rest, shut) >= 45
+    assert web.likeness(open_, wide) >= 45
+    assert web.psnr(shut, wide) < 40
+    assert web.likeness(turned, wide) < 30
     assert facts == ["img", "Avatar of drawn", False, 0]
     assert 1_590_000 < pixels < 1_610_000, "a large one is as sharp as a device can afford"
     assert gone is None
@@ -111,7 +100,7 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
 
 def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
     """It is seen by the scene's camera, hides what is behind it, and is hidden by what is before it."""
-    bundle(EXAMPLES / "three" / "main.js", site / "main.bundle.js", f"--alias:mien-web={site / 'mien.js'}")
+    web.bundle(EXAMPLES / "three" / "main.js", site / "main.bundle.js", f"--alias:mien-web={site / 'mien.js'}")
     (site / "three.html").write_text(PAGE)
     begin = """
       const { start } = await import("./main.bundle.js");
@@ -124,25 +113,25 @@ def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
       const { camera, boxes } = made;
       return Object.values(boxes).map((box) => { const p = box.position.clone().project(camera); return [p.x, p.y]; });
     """
-    steps = [script(begin, shot % 0), script(places), script(hidden, shot % 0), script(shot % 20)]
-    with served(site) as address:
-        told = browse(f"{address}/three.html", steps, size=(600, 600))
+    steps = [web.script(begin, shot % 0), web.script(places), web.script(hidden, shot % 0), web.script(shot % 20)]
+    with web.served(site) as address:
+        told = web.browse(f"{address}/three.html", steps, size=(600, 600))
     assert told["messages"] == []
     scene, (front, _), alone, turned = told["results"]
-    scene, alone, turned = (picture(address)[..., :3] for address in (scene, alone, turned))
+    scene, alone, turned = (web.picture(address)[..., :3] for address in (scene, alone, turned))
     row, column = round((1 - front[1]) / 2 * 400), round((1 + front[0]) / 2 * 400)
     assert scene[row, column, 0] > 2 * scene[row, column, 2], "the red box before the head"
     assert np.abs(scene - alone)[row, column].max() > 0.1
     # The whole blue box would take 0.16 of the picture.
     assert 0.03 < (scene[..., 2] > scene[..., 0] + 0.3).mean() < 0.11
-    exact = runtime.Avatar(drawn_head(2000, rank=2))
+    exact = runtime.Avatar(web.drawn_head(2000, rank=2))
     moved = runtime.Gaussians(**{**vars(exact.pose()), "T_world_local": np.eye(4, dtype=np.float32)})
     (expected, alpha), (aside, _) = (
         exact.render(moved, scene_camera(turn), background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
         for turn in (0.0, math.radians(20))
     )
-    assert psnr(alone, expected) >= 40
-    assert psnr(turned, aside) >= 40
+    assert web.psnr(alone, expected) >= 40
+    assert web.psnr(turned, aside) >= 40
     # Where the head is opaque, the box behind it changes nothing.
     near_blue = np.s_[:200, :200]
     assert np.abs(scene - alone).max(-1)[near_blue][alpha[near_blue] > 0.99].max() < 0.03
@@ -168,7 +157,7 @@ SEEN = """
 
 
 def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
-    drawn = drawn_head(1000)
+    drawn = web.drawn_head(1000)
     write_packed(site / "same.packed", drawn)
     runtime.write_portable(site / "same.mien", drawn)
     write_glb(site / "same.glb", drawn, mesh_model(drawn), 64)
@@ -180,23 +169,23 @@ def test_any_file_can_be_dropped_on_the_playground(site: Path) -> None:
       };
     """
     names = ("same.packed", "same.mien", "same.glb")
-    steps = [script(DROP % (name, name), SEEN) for name in names]
-    steps += [script("document.querySelector('nav button').click(); const words = { textContent: '' };", SEEN)]
-    steps += [script(DROP % ("none.txt", "none.txt"), SEEN)]
-    with served(site) as address:
-        told = browse(f"{address}/playground.html", steps, size=(600, 700), opening=kept)
+    steps = [web.script(DROP % (name, name), SEEN) for name in names]
+    steps += [web.script("document.querySelector('nav button').click(); const words = { textContent: '' };", SEEN)]
+    steps += [web.script(DROP % ("none.txt", "none.txt"), SEEN)]
+    with web.served(site) as address:
+        told = web.browse(f"{address}/playground.html", steps, size=(600, 700), opening=kept)
     words, addresses, faces = zip(*told["results"], strict=True)
     assert words[:3] == tuple(f"{name}: drag it, or press a face." for name in names)
     assert words[4] == "none.txt is not a .mien file"
     assert faces[2] > 5
     # Colours of clear pixels are rounded, so they count by their alpha.
-    packed, mien, glb, smile = (picture(url)[..., :3] * picture(url)[..., 3:] for url in addresses[:4])
+    packed, mien, glb, smile = (web.picture(url)[..., :3] * web.picture(url)[..., 3:] for url in addresses[:4])
     assert packed.std() > 0.05, "somebody is seen"
-    assert psnr(packed, mien) >= 40
+    assert web.psnr(packed, mien) >= 40
     np.testing.assert_array_equal(mien, glb)
-    assert psnr(smile, glb) < 45
-    with served(site) as address:
-        expect_usable(f"{address}/playground.html", "", DROP % ("me.packed", "me.packed"))
+    assert web.psnr(smile, glb) < 45
+    with web.served(site) as address:
+        web.expect_usable(f"{address}/playground.html", "", DROP % ("me.packed", "me.packed"))
 
 
 SURPRISE = """
@@ -219,9 +208,9 @@ def npm(folder: Path, *arguments: str | Path) -> str:
 def packed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("package")
     for name in ("package.json", "README.md", "LICENSE"):
-        shutil.copy(WEB / name, folder)
+        shutil.copy(web.WEB / name, folder)
     shutil.copytree(built, folder / "dist")
-    npm(WEB, "run", "types", "--", "--outDir", folder / "dist" / "types")
+    npm(web.WEB, "run", "types", "--", "--outDir", folder / "dist" / "types")
     npm(folder, "pack", "--ignore-scripts")
     (found,) = folder.glob("mien-web-*.tgz")
     return found
@@ -231,24 +220,24 @@ def test_the_starter_is_built_as_its_readme_says_and_shows_an_avatar(packed: Pat
     """It takes the package from the folder above it, since no registry has it."""
     with tarfile.open(packed) as package:
         package.extractall(tmp_path, filter="data")
-    starter = Path(shutil.copytree(WEB / "examples" / "starter", tmp_path / "package" / "examples" / "starter"))
+    starter = Path(shutil.copytree(web.WEB / "examples" / "starter", tmp_path / "package" / "examples" / "starter"))
     npm(starter, "install", "--no-audit", "--no-fund")
-    write_packed(starter / "public" / "me.packed", drawn_head(500))
+    write_packed(starter / "public" / "me.packed", web.drawn_head(500))
     npm(starter, "run", "build")
-    with served(starter / "dist") as address:
-        told = browse(address, [script(LOADED, SURPRISE)], size=(640, 480))
-        assert violations(address, (390, 844), (), "", LOADED) == [], "before and after its avatar is there"
+    with web.served(starter / "dist") as address:
+        told = web.browse(address, [web.script(LOADED, SURPRISE)], size=(640, 480))
+        assert web.violations(address, (390, 844), (), "", LOADED) == [], "before and after its avatar is there"
     ((count, jaw, shown),) = told["results"]
     assert told["messages"] == []
     assert count >= 6
     assert jaw > 0.1
-    assert len(np.unique(picture(shown).reshape(-1, 4), axis=0)) > 500, "a head in many colours is drawn"
+    assert len(np.unique(web.picture(shown).reshape(-1, 4), axis=0)) > 500, "a head in many colours is drawn"
     # The package has every file that package.json names, with types, and nothing else goes to a registry.
-    package = json.loads((WEB / "package.json").read_text())
+    package = json.loads((web.WEB / "package.json").read_text())
     assert "dependencies" not in package
-    readme = (WEB / "README.md").read_text()
+    readme = (web.WEB / "README.md").read_text()
     assert "](" not in readme.replace("](https://", ""), "links to files of the repository lead nowhere on npm"
-    assert (WEB / "LICENSE").read_text() == (WEB.parent / "LICENSE").read_text()
+    assert (web.WEB / "LICENSE").read_text() == (web.WEB.parent / "LICENSE").read_text()
     with tarfile.open(packed) as archive:
         files = {name.removeprefix("package/") for name in archive.getnames()}
     wanted = {path.removeprefix("./") for export in package["exports"].values() for path in export.values()}

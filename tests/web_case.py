@@ -262,7 +262,7 @@ def drawn_head(
     if rank:
         regions, pose, rest = 5, rank // 2, np.zeros(inputs, np.float32)
         own, taken = regions * (rank - pose), columns or rank
-        at_rest = normal(6, spread=0.1) - np.float32([0, 0, 0, 0, 0, 0.9])
+        at_rest = normal(6, spread=0.1) - np.array([0, 0, 0, 0, 0, 0.9], np.float32)
         head = HeadActivations(at_rest, normal(6, pose, spread=4.0), normal(7, pose))
         shares = np.random.default_rng(2).dirichlet(np.ones(regions), len(baked.faces)).astype(np.float32)
         shares[::3] = np.eye(regions, dtype=np.float32)[0]
@@ -275,9 +275,7 @@ def drawn_head(
         changes = runtime.ExpressionChanges(
             rest, normal(inputs, own), normal(7, own), *parts, network, columns, shares, head
         )
-        filmed = runtime.Filmed(
-            rest, rest + 1, np.eye(inputs, dtype=np.float32), np.ones(1, np.float32), np.zeros((2, 2), np.float32)
-        )
+        filmed = runtime.Filmed(rest, rest + 1, np.zeros((2, 2), np.float32))
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)
     baked = replace(
         baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes

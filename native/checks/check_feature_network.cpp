@@ -1,7 +1,9 @@
-// The network of blended features and the update of its bases: odd widths, the same bits for any number of threads.
+// The network of blended features, the update of its bases, and changes with the expression: odd widths, the same bits
+// for any number of threads, with inputs for all Gaussians and with tables of them.
 #include <algorithm>
 
 #include "checks.h"
+#include "expression_change.h"
 #include "feature_network.h"
 #include "pool.h"
 #include "training.h"
@@ -19,28 +21,30 @@ struct NetworkResult {
   bool operator==(const NetworkResult&) const = default;
 };
 
-std::vector<mien::FeatureInput> inputs_of(const Sizes& s, const Floats& bases, const Floats& values, bool by_input) {
-  const int64_t between = by_input ? s.count * s.features : s.features;
-  const int64_t stride = by_input ? s.features : s.inputs * s.features;
-  std::vector<mien::FeatureInput> items;
-  for (int64_t k = 0; k < s.inputs; ++k) items.push_back({bases.data() + k * between, stride, values[k]});
-  return items;
+constexpr int64_t kTable = 3;  // rows of a table
+
+// A row of a table for each Gaussian.
+std::vector<int64_t> rows_of(int64_t count, Random& random) {
+  std::vector<int64_t> rows(count);
+  for (int64_t& row : rows) row = random.below(kTable);
+  return rows;
 }
 
-NetworkResult run(const Sizes& s, bool by_input) {
+NetworkResult run(const Sizes& s, bool by_row) {
   Random random(3);
   const int64_t in = s.features + s.own;
   const Floats bases = random.normal(s.count * s.inputs * s.features), neutral = random.normal(s.count * s.features);
-  Floats values = random.normal(s.inputs);
-  if (s.inputs > 2) values[1] = 0;
+  Floats values = random.normal(kTable * s.inputs);
+  for (int64_t row = 0; s.inputs > 2 && row < kTable; ++row) values[row * s.inputs + 1] = 0;
+  const std::vector<int64_t> rows = rows_of(s.count, random);
   const Floats own = random.normal(s.count * s.own), weight1 = random.normal(s.hidden * in);
   const Floats bias1 = random.normal(s.hidden), weight2 = random.normal(s.width * s.hidden);
   const Floats bias2 = random.normal(s.width);
   const mien::FeatureNetwork network{s.count,      s.features,     s.own,       s.hidden,
                                      s.width,      neutral.data(), own.data(),  weight1.data(),
                                      bias1.data(), weight2.data(), bias2.data()};
-  const auto items = inputs_of(s, bases, values, by_input);
-  const mien::FeatureInputs inputs{items.data(), s.inputs};
+  if (!by_row) values.resize(s.inputs);
+  const mien::FeatureInputs inputs{bases.data(), s.inputs, values.data(), by_row ? rows.data() : nullptr};
   Floats features(s.count * s.features), hidden(s.count * mien::hidden_stride(s.hidden));
   NetworkResult r;
   r.outputs.resize(s.count * (s.width - 1));
@@ -55,26 +59,26 @@ NetworkResult run(const Sizes& s, bool by_input) {
     std::fill_n(by_outputs.begin() + i * (s.width - 1), s.width - 1, 0.0f);
   }
   r.by_features.resize(neutral.size()), r.by_weight1.resize(weight1.size()), r.by_bias1.resize(s.hidden);
-  r.by_weight2.resize(weight2.size()), r.by_bias2.resize(s.width), r.by_inputs.resize(s.inputs);
+  r.by_weight2.resize(weight2.size()), r.by_bias2.resize(s.width), r.by_inputs.resize(by_row ? 0 : s.inputs);
   r.by_owns.resize(own.size());
   mien::feature_network_backward(
       network, inputs, {features.data(), hidden.data()},
       {by_outputs.data(), by_last.data(), r.by_features.data(), r.by_weight1.data(), r.by_bias1.data(),
-       r.by_weight2.data(), r.by_bias2.data(), r.by_inputs.data(), r.by_owns.data()});
+       r.by_weight2.data(), r.by_bias2.data(), by_row ? nullptr : r.by_inputs.data(), r.by_owns.data()});
   return r;
 }
 
 void check_network() {
   for (const Sizes& sizes : {Sizes{0, 3, 4, 2, 5, 3}, Sizes{1, 1, 1, 0, 1, 1}, Sizes{47, 4, 15, 3, 17, 16},
                              Sizes{49, 2, 16, 27, 64, 49}, Sizes{1700, 5, 33, 1, 9, 18}}) {
-    for (bool by_input : {false, true}) {
+    for (bool by_row : {false, true}) {
       mien::set_thread_count(1);
-      const NetworkResult serial = run(sizes, by_input);
+      const NetworkResult serial = run(sizes, by_row);
       CHECK(all_finite(serial.outputs) && all_finite(serial.by_features) && all_finite(serial.by_weight1));
       CHECK(all_finite(serial.by_weight2) && all_finite(serial.by_inputs) && all_finite(serial.by_bias1));
       CHECK(all_finite(serial.by_owns));
       mien::set_thread_count(3);
-      CHECK(run(sizes, by_input) == serial);
+      CHECK(run(sizes, by_row) == serial);
     }
   }
 }
@@ -82,16 +86,19 @@ void check_network() {
 // Adam on factors has the bits of Adam on their product, for any number of threads.
 void check_adam() {
   for (int width : {1, 15, 16, 33}) {
-    for (int threads : {1, 3}) {
-      mien::set_thread_count(threads);
+    for (bool by_row : {false, true}) {
+      mien::set_thread_count(by_row ? 1 : 3);
       Random random(6);
       const int64_t count = 300, columns_count = 5, size = count * columns_count * width;
       Floats values = random.normal(size), first = random.normal(size), second = random.uniform(size);
       Floats plain = values, plain_first = first, plain_second = second, gradient(size);
-      const Floats rows = random.normal(count * width), columns = random.normal(columns_count);
-      for (int64_t i = 0; i < size; ++i)
-        gradient[i] = rows[i / (columns_count * width) * width + i % width] * columns[i / width % columns_count];
-      const mien::FactoredTerm term{rows.data(), columns.data()};
+      const Floats rows = random.normal(count * width), columns = random.normal(kTable * columns_count);
+      const std::vector<int64_t> places = rows_of(count, random);
+      for (int64_t i = 0; i < size; ++i) {
+        const int64_t index = i / (columns_count * width), row = by_row ? places[index] : 0;
+        gradient[i] = rows[index * width + i % width] * columns[row * columns_count + i / width % columns_count];
+      }
+      const mien::FactoredTerm term{rows.data(), columns.data(), by_row ? places.data() : nullptr};
       mien::factored_adam_update({values.data(), &term, first.data(), second.data(), count,
                                   static_cast<int>(columns_count), width, 1, 0.01f, 2.0f});
       const mien::AdamTask task{plain.data(), gradient.data(), plain_first.data(), plain_second.data(), size, 0.01f,
@@ -111,14 +118,16 @@ void check_update() {
       const int64_t count = 1700, columns_count = 3;
       Floats values = random.normal(count * columns_count * width), second = random.uniform(count * width);
       Floats weights = random.uniform(count), rows = random.normal(count * width),
-             columns = random.normal(columns_count), other = random.normal(count * width);
+             columns = random.normal(kTable * columns_count), other = random.normal(count * width);
       std::fill_n(rows.begin(), 5 * width, 0.0f);
       columns[1] = 0;
+      const std::vector<int64_t> places = rows_of(count, random);
       // The third term takes the first away, but for rounding.
       Floats against = rows;
       for (float& value : against) value = -value;
-      const mien::FactoredTerm terms[] = {
-          {rows.data(), columns.data()}, {other.data(), columns.data()}, {against.data(), columns.data()}};
+      const mien::FactoredTerm terms[] = {{rows.data(), columns.data(), places.data()},
+                                          {other.data(), columns.data()},
+                                          {against.data(), columns.data(), places.data()}};
       for (const int used : {1, 3}) {
         mien::factored_update(
             {values.data(), count, columns_count, width, terms, used, second.data(), weights.data(), 0.01f});
@@ -130,9 +139,45 @@ void check_update() {
   }
 }
 
+Floats changes(int64_t count, int64_t values, int64_t rank, bool by_row) {
+  Random random(7);
+  const Floats inputs = random.normal(11), rest = random.normal(11), directions = random.normal(11 * rank * kTable);
+  const Floats seen = random.normal(4 * rank * kTable), shares = random.uniform(count * kTable);
+  Floats own(rank * kTable), table(count * rank), motion(6);
+  mien::expression_activations({inputs.data(), 11, rest.data(), directions.data(), rank * kTable, rank, seen.data(), 4},
+                               own.data());
+  mien::blend_regions(shares.data(), own.data(), count, kTable, rank, table.data());
+  mien::head_motion(rest.data(), inputs.data(), motion.data());
+  const std::vector<int64_t> rows = rows_of(count, random);
+  const Floats& activations = by_row ? own : table;
+  const mien::ExpressionBases bases{count, values, rank, activations.data(), by_row ? rows.data() : nullptr};
+  const Floats basis = random.normal(count * values * rank);
+  Floats out(count * values), gradient(basis.size());
+  mien::expression_change(bases, basis.data(), out.data());
+  mien::expression_change_backward(bases, out.data(), gradient.data());
+  out.insert(out.end(), gradient.begin(), gradient.end());
+  out.insert(out.end(), motion.begin(), motion.end());
+  return out;
+}
+
+void check_changes() {
+  for (int64_t count : {1, 5, 9000}) {
+    for (int64_t rank : {1, 3, 11}) {
+      for (bool by_row : {false, true}) {
+        mien::set_thread_count(1);
+        const Floats serial = changes(count, rank == 3 ? 1 : 3, rank, by_row);
+        CHECK(all_finite(serial));
+        mien::set_thread_count(3);
+        CHECK(changes(count, rank == 3 ? 1 : 3, rank, by_row) == serial);
+      }
+    }
+  }
+}
+
 }  // namespace
 
 void check_feature_network() {
+  check_changes();
   check_network();
   check_update();
   check_adam();

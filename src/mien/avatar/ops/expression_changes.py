@@ -103,8 +103,7 @@ class ExpressionActivations(nn.Module):
         regions = self.shares.shape[1]
         block = self.directions.shape[1] // regions
         found = ((expression_inputs(face)[0] - self.rest) @ self.directions).view(regions, block)
-        limits = self.seen.view(len(self.seen), regions, block).unbind(1)
-        own = torch.stack([within_seen(one[None], limit)[0] for one, limit in zip(found, limits, strict=True)])
+        own = within_seen(found, self.seen.view(-1, regions, block))
         at_rest = FaceParams(
             face.identity, face.expression, face.joints, self.head_rest[None, :3], self.head_rest[None, 3:]
         )
@@ -172,7 +171,7 @@ def outermost(activations: Float[Tensor, "t r"]) -> Float[Tensor, "s r"]:
     return activations[(exact @ exact.T).argmax(0).unique().to(activations.device)]
 
 
-def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s r"]) -> Float[Tensor, "b r"]:
+def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s ... r"]) -> Float[Tensor, "b r"]:
     """`values`, but where they are longer than any row of `seen` goes along them: there they get shorter.
 
     With l the furthest that a row of `seen` goes along them, the new length approaches (1 + `MARGIN`) l and never gets
@@ -183,7 +182,8 @@ def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s r"]) -> Flo
     """
     if not len(seen):
         return values
-    furthest = (values @ seen.T).amax(-1, keepdim=True).clamp_min(_LEAST_SEEN)
+    products = torch.einsum("br,sbr->bs", values, seen) if seen.ndim == 3 else values @ seen.T
+    furthest = products.amax(-1, keepdim=True).clamp_min(_LEAST_SEEN)
     ratio = values.square().sum(-1, keepdim=True) / furthest
     over = (ratio - 1).clamp_min(0)
     shortened = (1 + MARGIN * over / (MARGIN + over)) / ratio.clamp_min(1)
