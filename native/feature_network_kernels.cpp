@@ -207,38 +207,37 @@ MIEN_INLINE void factor_steps(const FactoredUpdate& task, const float* products,
   }
 }
 
-MIEN_INLINE bool untouched(const FactoredUpdate& task, int64_t index) {
-  for (int t = 0; t < task.terms_count; ++t)
-    if (!all_zero(task.terms[t].rows + index * task.width, task.width)) return false;
+// Whether each term's rows or columns are all 0.
+MIEN_INLINE bool untouched(const FactoredUpdate& task, const float* products, int64_t index) {
+  for (int t = 0; t < task.terms_count; ++t) {
+    const bool has_columns = products[t * (task.terms_count + 1)] > 0;
+    if (has_columns && !all_zero(task.terms[t].rows + index * task.width, task.width)) return false;
+  }
   return true;
 }
 
-// The means of the products of two terms' columns, times 1 - beta2 of Adam. Whether one of the squares is not 0.
-MIEN_INLINE bool fill_products(const FactoredUpdate& task, int64_t index, float* products) {
+// The means of the products of two terms' columns, times 1 - beta2 of Adam.
+MIEN_INLINE void fill_products(const FactoredUpdate& task, int64_t index, float* products) {
   const int terms = task.terms_count, count = task.columns_count;
-  bool any = false;
   for (int s = 0; s < terms; ++s) {
     const float* one = task.terms[s].columns_of(index, count);
     for (int t = 0; t <= s; ++t) {
       const float* other = task.terms[t].columns_of(index, count);
       float product = 0;
       for (int k = 0; k < count; ++k) product += one[k] * other[k];
-      const float mean = product / static_cast<float>(count > 0 ? count : 1);
-      any = any || (s == t && mean > 0);
-      products[s * terms + t] = 0.001f * mean;
+      products[s * terms + t] = 0.001f * product / static_cast<float>(count > 0 ? count : 1);
     }
   }
-  return any;
 }
 
 void update(const FactoredUpdate& task, float* products, float* steps, int64_t first, int64_t end) {
   [[maybe_unused]] const NoDenormals guard;
   bool by_row = false;
   for (int t = 0; t < task.terms_count; ++t) by_row = by_row || task.terms[t].places;
-  if (!by_row && !fill_products(task, 0, products)) return;
+  if (!by_row) fill_products(task, 0, products);
   for (int64_t index = first; index < end; ++index) {
-    if (untouched(task, index)) continue;
-    if (by_row && !fill_products(task, index, products)) continue;
+    if (by_row) fill_products(task, index, products);
+    if (untouched(task, products, index)) continue;
     factor_steps(task, products, index, steps);
     float* values = task.values + index * task.columns_count * task.width;
     for (int k = 0; k < task.columns_count; ++k, values += task.width) {

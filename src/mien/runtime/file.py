@@ -106,11 +106,19 @@ def _tree(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     return value
 
 
+_LATER: dict[str, dict[str, Any]] = {"ExpressionChanges": {"shares": None, "head": None}}
+"""Fields that files of an earlier mien lack, by record, and what they stand for."""
+_GONE = {"Filmed": ("directions", "reach")}
+"""Fields that only files of an earlier mien have, by record."""
+
+
 def _restored(node: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(node, dict) and set(node) == {"tensor"}:
         return arrays.pop(node["tensor"])
     if isinstance(node, dict):
-        return {key: _restored(item, arrays) for key, item in node.items()}
+        kind = node.get("kind", "")
+        known, gone = _LATER.get(kind, {}) | node, _GONE.get(kind, ())
+        return {key: _restored(item, arrays) for key, item in known.items() if key not in gone}
     return [_restored(item, arrays) for item in node] if isinstance(node, list) else node
 
 

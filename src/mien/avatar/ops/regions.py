@@ -15,8 +15,8 @@ _BROW, _BROW_BLEND, _EYE, _EYE_BLEND = 0.55, 0.4, -0.75, 0.6
 """Borders below brows and eyes, and the widths over which regions blend there: heights above the eyes' centres, in
 units of the distance from there to the brows."""
 _FACE, _FACE_BLEND = 0.95, 0.2
-"""Border of the face, and the width over which it blends with what is around it: in units of the ellipse through the
-ears' landmarks, as high as from the chin to `_TOP` above the brows, in units of the same distance."""
+"""Border of the face, and the width over which it blends with what is around it: in units of a rounded rectangle, as
+wide as the ears' landmarks, as high as from the chin to `_TOP` above the brows, in units of the same distance."""
 _TOP = 1.2
 _MIDDLE_BLEND = 0.25  # width over which left and right blend, in units of the distance between the eyes' outer corners
 
@@ -38,12 +38,14 @@ def region_shares(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, "
     width = _MIDDLE_BLEND * (marks[45, 0] - marks[36, 0]).abs()
     left = _smooth_step(vertices[:, 0], marks[27:31, 0].mean(), width)
     sides = torch.stack([left, 1 - left], 1)
+    turning = [index for index, name in enumerate(face_model.joint_names) if "eye" in name]
+    brows = brows * (1 - face_model.skinning_weights[:, turning].sum(1))  # eyeballs reach up behind the brows
     brow, eye = upper * brows, upper * (1 - brows)
     parts = torch.cat([brow[:, None] * sides, eye[:, None] * sides, 1 - upper[:, None]], 1)
     chin, top = marks[8, 1], eyes + (1 + _TOP) * gap
     wide, high = (marks[16, 0] - marks[0, 0]).abs() / 2, (top - chin) / 2
     middle = torch.stack([marks[[0, 16], 0].mean(), (top + chin) / 2])
-    away = ((vertices[:, :2] - middle) / torch.stack([wide, high])).norm(dim=1)
+    away = ((vertices[:, :2] - middle) / torch.stack([wide, high])).norm(p=4, dim=1)
     behind = _smooth_step(marks[[0, 16], 2].mean() - vertices[:, 2], torch.zeros(()).to(wide), _FACE_BLEND * wide)
     around = torch.maximum(_smooth_step(away, torch.tensor(_FACE).to(wide), torch.tensor(_FACE_BLEND).to(wide)), behind)
     around = around * _smooth_step(vertices[:, 1], chin, _FACE_BLEND * high)

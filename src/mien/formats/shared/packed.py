@@ -78,7 +78,7 @@ _CODES = {
     "avatar.baked.changes.color": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
     "avatar.baked.changes.means": _Code(8, "columns", signed=True, levels=63),
-    "avatar.baked.changes.shares": _Code(8, "columns", signed=True),
+    "avatar.baked.changes.shares": _Code(8, "columns"),
     "avatar.baked.changes.features.neutral": _Code(8, "columns"),
     "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
     "avatar.baked.changes.features.own": _Code(8, "columns"),
