@@ -168,8 +168,8 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
 def test_head_pose_can_be_left_out_and_limits_hold(landmarks: np.ndarray) -> None:
     inputs = len(MODEL.expression_names) + 3 * len(MODEL.free_joint_names)
     zeros, aside = np.zeros(inputs, np.float32), np.array([0, 0, 1], np.float32)
-    spread, ellipse = np.eye(inputs, dtype=np.float32), np.zeros((2, 2), np.float32)
-    filmed = runtime.Filmed(zeros, zeros, spread, np.full(1, 9.0, np.float32), ellipse)
+    ellipse = np.zeros((2, 2), np.float32)
+    filmed = runtime.Filmed(zeros, zeros, ellipse)
     still = follower(head_pose=False)
     given = MODEL, MODEL.neutral(), filmed, aside
     kept, free = (Follower(*given, FollowOptions(unlimited=which)) for which in (False, True))

@@ -68,7 +68,7 @@ def test_sliders_and_random_faces_change_the_face_within_bounds(session: Session
     assert len(changes) == 6
     portable = session.avatar.portable
     eye = np.eye(len(portable.neutral.expression) + portable.neutral.joints.size, dtype=np.float32)
-    limits = runtime.Filmed(0 * eye[0], 0 * eye[0], eye, np.ones(1, np.float32), np.ones((2, 2), np.float32))
+    limits = runtime.Filmed(0 * eye[0], 0 * eye[0], np.ones((2, 2), np.float32))
     limited = Session(runtime.Avatar(replace(portable, filmed=limits)))
     for one in (session, limited):
         one.take_random(np.random.default_rng(3))
@@ -206,7 +206,7 @@ def test_the_filmed_frame_is_beside_the_avatar(session: Session) -> None:
 def test_words_tell_which_side_was_filmed(session: Session) -> None:
     face, viewmat = session.avatar.face(head_rotation=(0, 0, 0), head_translation=(0, 0, 0)), np.eye(4)
     limits, nothing = np.radians([[-30, 40], [-10, 10]]).astype(np.float32), np.zeros(1, np.float32)
-    filmed = runtime.Filmed(nothing, nothing, nothing[None], nothing, limits)
+    filmed = runtime.Filmed(nothing, nothing, limits)
     for yaw, pitch, words in (
         (35, 5, "This side was filmed."),
         (60, 0, "Beyond what was filmed by 20° sideways:"),
