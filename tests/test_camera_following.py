@@ -173,13 +173,14 @@ def test_head_pose_can_be_left_out_and_limits_hold(landmarks: np.ndarray) -> Non
     still = follower(head_pose=False)
     given = MODEL, MODEL.neutral(), filmed, aside
     kept, free = (Follower(*given, FollowOptions(unlimited=which)) for which in (False, True))
-    jaws, turn = np.zeros(2), 0.0
+    most, turn = np.zeros((2, 2)), 0.0
     for index in (*range(0, 35, 3), *range(36, len(landmarks), 8)):
         assert not still(landmarks[index], SIZE, SIZE, index / FPS).head_rotation.any()
         faces = [one(landmarks[index], SIZE, SIZE, index / FPS) for one in (kept, free)]
-        jaws = np.maximum(jaws, [face.expression[column("jawOpen")] for face in faces])
+        most = np.maximum(most, [face.expression[[column("mouthRight"), column("jawOpen")]] for face in faces])
         turn = max(turn, float(np.abs(faces[1].head_rotation).max()))
-    assert jaws[0] < 0.2 < jaws[1]
+    assert most[0, 0] < 0.2 < most[1, 0]
+    assert most[0, 1] == most[1, 1] > 0.3, "an open mouth is common, and goes its full way"
     assert turn > 0.1
 
 
