@@ -63,9 +63,9 @@ class ExpressionActivations(nn.Module):
         shares, motions = region_shares(face_model, neutral), vertex_motions(face_model, neutral)
         rest = expression_inputs(neutral)[0]
         offsets, own = expression_inputs(face) - rest, (count + 1) // 2
-        roots = [_weighted_root(motions, share) for share in shares.unbind(1)]
-        if len(roots) > 1:
-            roots[-1] = None  # what is around the face moves with none of it, and changes with all of it
+        # What is around the face moves with none of it, and changes with all of it.
+        own_motion = shares.unbind(1) if shares.shape[1] == 1 else shares.unbind(1)[:-1]
+        roots = [_weighted_root(motions, share) for share in own_motion] + [None] * (shares.shape[1] - len(own_motion))
         parts = [principal_directions(offsets, own, root) for root in roots]
         seen = [_EXPRESSIONS_BEYOND * outermost(offsets @ part) for part in parts]
         moved = head_motion(neutral, face)

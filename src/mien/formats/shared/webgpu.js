@@ -1,18 +1,26 @@
-"use strict";var mienWebGpu=(()=>{var N=Object.defineProperty;var Z=Object.getOwnPropertyDescriptor;var Q=Object.getOwnPropertyNames;var ee=Object.prototype.hasOwnProperty;var re=(n,e)=>{for(var r in e)N(n,r,{get:e[r],enumerable:!0})},te=(n,e,r,a)=>{if(e&&typeof e=="object"||typeof e=="function")for(let t of Q(e))!ee.call(n,t)&&t!==r&&N(n,t,{get:()=>e[t],enumerable:!(a=Z(e,t))||a.enumerable});return n};var ae=n=>te(N({},"__esModule",{value:!0}),n);var le={};re(le,{findBackend:()=>ue});function M({neutral:n,basis:e,biases:r},a){return{width:n.length/Math.max(a,1),rank:e.length/Math.max(n.length,1),hidden:r[0].length}}function C({own:n,weights:e,biases:r},a,t){let o=r[0].length,s=n.length/Math.max(a,1),u=new Float32Array(a*o);for(let c=0;c<a;++c)for(let i=0;i<o;++i){let l=r[0][i];for(let d=0,f=i*(t+s)+t;d<s;++d)l+=e[0][f+d]*n[c*s+d];u[c*o+i]=l}return u}var x=class extends Error{};var he=1<<27,pe=1<<23;var P=class{constructor(e){this.device=e;this.buffers=[]}storage(e,r=0){let{STORAGE:a,COPY_SRC:t}=GPUBufferUsage,{maxStorageBufferBindingSize:o,maxBufferSize:s}=this.device.limits,u=4*(typeof e=="number"?e:e.length);if(u>Math.min(o,s))throw new x("has more Gaussians than this device can hold");let c=this.buffer(u,a|t|r);return typeof e!="number"&&this.write(c,e),c}indirect(e){return this.storage(e,GPUBufferUsage.INDIRECT)}uniform(e){return this.buffer(4*e,GPUBufferUsage.UNIFORM)}write(e,r){this.device.queue.writeBuffer(e,0,r)}group(e,r){return this.device.createBindGroup({layout:e,entries:r.map((a,t)=>({binding:t,resource:{buffer:a}}))})}free(){for(let e of this.buffers)e.destroy()}buffer(e,r){let a=this.device.createBuffer({size:Math.max(64,e),usage:r|GPUBufferUsage.COPY_DST});return this.buffers.push(a),a}};function w(n,e,r,a){n.setPipeline(e),n.setBindGroup(0,r),n.dispatchWorkgroups(a)}var y=256,b=1024,E=128,S=`
+"use strict";var mienWebGpu=(()=>{var N=Object.defineProperty;var re=Object.getOwnPropertyDescriptor;var te=Object.getOwnPropertyNames;var ae=Object.prototype.hasOwnProperty;var oe=(s,e)=>{for(var r in e)N(s,r,{get:e[r],enumerable:!0})},ne=(s,e,r,t)=>{if(e&&typeof e=="object"||typeof e=="function")for(let a of te(e))!ae.call(s,a)&&a!==r&&N(s,a,{get:()=>e[a],enumerable:!(t=re(e,a))||t.enumerable});return s};var se=s=>ne(N({},"__esModule",{value:!0}),s);var de={};oe(de,{findBackend:()=>fe});function I({neutral:s,basis:e,biases:r},t){return{width:s.length/Math.max(t,1),rank:e.length/Math.max(s.length,1),hidden:r[0].length}}function C({own:s,weights:e,biases:r},t,a){let o=r[0].length,n=s.length/Math.max(t,1),u=new Float32Array(t*o);for(let l=0;l<t;++l)for(let i=0;i<o;++i){let c=r[0][i];for(let f=0,h=i*(a+n)+a;f<n;++f)c+=e[0][h+f]*s[l*n+f];u[l*o+i]=c}return u}function z({rest:s,directions:e,shares:r,head:t},a){let o=r?r.length/Math.max(a,1):1,n=e.length/s.length/o;return{regions:o,own:n,width:n+(t?t.directions.length/6:0)}}var A=class extends Error{};var ye=1<<27,ve=1<<23;var k=class{constructor(e){this.device=e;this.buffers=[]}storage(e,r=0){let{STORAGE:t,COPY_SRC:a}=GPUBufferUsage,{maxStorageBufferBindingSize:o,maxBufferSize:n}=this.device.limits,u=4*(typeof e=="number"?e:e.length);if(u>Math.min(o,n))throw new A("has more Gaussians than this device can hold");let l=this.buffer(u,t|a|r);return typeof e!="number"&&this.write(l,e),l}indirect(e){return this.storage(e,GPUBufferUsage.INDIRECT)}uniform(e){return this.buffer(4*e,GPUBufferUsage.UNIFORM)}write(e,r){this.device.queue.writeBuffer(e,0,r)}group(e,r){return this.device.createBindGroup({layout:e,entries:r.map((t,a)=>({binding:a,resource:{buffer:t}}))})}free(){for(let e of this.buffers)e.destroy()}buffer(e,r){let t=this.device.createBuffer({size:Math.max(64,e),usage:r|GPUBufferUsage.COPY_DST});return this.buffers.push(t),t}};function x(s,e,r,t){s.setPipeline(e),s.setBindGroup(0,r),s.dispatchWorkgroups(t)}var g=256,w=1024,E=128,S=`
 struct Pose{
 count:u32,triangles:u32,columns:u32,
 bias:vec4f,
 activations:array<vec4f,${E/4}>,
 }
-@group(0)@binding(0)var<uniform>pose:Pose;
-fn activation(k:u32)->f32{return pose.activations[k>>2][k&3];}`,z=`${S}
+@group(0)@binding(0)var<uniform>pose:Pose;`,O=(s,e,r)=>`
+@group(0)@binding(${r})var<storage,read>shares:array<f32>;
+fn activation(triangle:u32,k:u32)->f32{
+var sum=0.;
+for(var g=0u;g<${s};g++){
+let at=g*${e}+k;
+sum+=shares[triangle*${s}+g]*pose.activations[at>>2][at&3];
+}
+return sum;
+}`,D=`${S}
 @group(0)@binding(1)var<storage,read>points:array<f32>;
 @group(0)@binding(2)var<storage,read>faces:array<u32>;
 @group(0)@binding(3)var<storage,read_write>frames:array<vec4f>;
 const DEGENERATE_LENGTH=1e-7;
 fn at(i:u32)->vec3f{return vec3f(points[3*i],points[3*i+1],points[3*i+2]);}
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn main(@builtin(global_invocation_id)id:vec3u){
 let f=id.x;
 if(f>=pose.triangles){return;}
@@ -31,68 +39,70 @@ let height=length(normal);let k=(edge+height)/2;
 normal/=height;
 let last=cross(first,normal);let middle=(a+b+c)/3;
 for(var row=0u;row<3;row++){frames[3*f+row]=vec4f(k*first[row],k*normal[row],k*last[row],middle[row]);}
-}`,O=`${S}
+}`,$=(s,e)=>`${S}${O(s,e,6)}
 @group(0)@binding(1)var<storage,read>restMeans:array<vec4f>;
 @group(0)@binding(2)var<storage,read>restColors:array<vec4f>;
 @group(0)@binding(3)var<storage,read>basis:array<vec4f>;
 @group(0)@binding(4)var<storage,read_write>means:array<vec4f>;
 @group(0)@binding(5)var<storage,read_write>colors:array<vec4f>;
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn main(@builtin(global_invocation_id)id:vec3u){
 let i=id.x;
 if(i>=pose.count){return;}
 var mean=restMeans[i];
 var color=restColors[i];
 for(var k=0u;k<pose.columns;k++){
-let a=activation(k);let first=basis[2*(i*pose.columns+k)];
+let a=activation(u32(mean.w),k);let first=basis[2*(i*pose.columns+k)];
 mean+=a*vec4f(first.xyz,0);
 color+=a*vec4f(basis[2*(i*pose.columns+k)+1].xyz,first.w);
 }
 means[i]=mean;
 colors[i]=color;
-}`;function I(n,e,r){return`${S}
+}`;function j(s,e,r,t){return`${S}${O(t,e,6)}
 @group(0)@binding(1)var<storage,read>neutral:array<vec2u>;
 @group(0)@binding(2)var<storage,read>basis:array<vec2u>;
 @group(0)@binding(3)var<storage,read>own:array<vec2u>;
 @group(0)@binding(4)var<storage,read>weights:array<vec4f>;
 @group(0)@binding(5)var<storage,read_write>colors:array<vec4f>;
+@group(0)@binding(7)var<storage,read>means:array<vec4f>;
 fn four(halves:vec2u)->vec4f{return vec4f(unpack2x16float(halves.x),unpack2x16float(halves.y));}
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn main(@builtin(global_invocation_id)id:vec3u){
 let i=id.x;
 if(i>=pose.count){return;}
-var f:array<vec4f,${n}>;
-for(var t=0u;t<${n};t++){f[t]=four(neutral[i*${n}+t]);}
+let triangle=u32(means[i].w);
+var f:array<vec4f,${s}>;
+for(var t=0u;t<${s};t++){f[t]=four(neutral[i*${s}+t]);}
 for(var k=0u;k<${e};k++){
-let a=activation(k);
+let a=activation(triangle,k);
 if(a !=0){
-for(var t=0u;t<${n};t++){f[t]+=a*four(basis[(i*${e}+k)*${n}+t]);}
+for(var t=0u;t<${s};t++){f[t]+=a*four(basis[(i*${e}+k)*${s}+t]);}
 }
 }
 var sum=pose.bias;
 for(var h=0u;h<${r};h++){
-let w=h*${n+1};
+let w=h*${s+1};
 var x=four(own[i*${r/4}+(h>>2)])[h&3];
-for(var t=0u;t<${n};t++){x+=dot(weights[w+t],f[t]);}
-sum+=weights[w+${n}]*select(x,${.01}*x,x<0);
+for(var t=0u;t<${s};t++){x+=dot(weights[w+t],f[t]);}
+sum+=weights[w+${s}]*select(x,${.01}*x,x<0);
 }
 colors[i]+=sum;
-}`}var _=`
+}`}var F=`
 struct View{
 head:array<vec4f,3>,
 directions:array<vec4f,3>,
 focal:vec2f,centre:vec2f,size:vec2f,
 count:u32,shRest:u32,
 background:vec4f,
-}`,D=`
+}`,V=`
 struct Splat{
 place:vec4f,
 shape:vec4f,
 color:vec4f,
-}`,$="near:NUMBER,far:NUMBER,vertices:u32,visible:NUMBER,firstVertex:u32,firstInstance:u32",V=`${_}${D}
-struct State{${$.replace(/NUMBER/g,"atomic<u32>")}}
+}`,q="near:NUMBER,far:NUMBER,vertices:u32,visible:NUMBER,firstVertex:u32,firstInstance:u32",H=`${F}${V}
+struct State{${q.replace(/NUMBER/g,"atomic<u32>")}}
 @group(0)@binding(0)var<uniform>view:View;
 @group(0)@binding(1)var<storage,read>frames:array<vec4f>;
 @group(0)@binding(2)var<storage,read>means:array<vec4f>;
@@ -180,7 +190,7 @@ vec4f(sqrt(yy/determinant*HALF_LOG2E),sqrt(HALF_LOG2E/yy),sqrt(determinant/yy),s
 return bitcast<u32>(p.z);
 }
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn main(@builtin(global_invocation_id)id:vec3u,@builtin(local_invocation_index)thread:u32){
 if(thread==0){atomicStore(&near,UNSEEN);}
 workgroupBarrier();
@@ -200,8 +210,8 @@ atomicMin(&state.near,atomicLoad(&near));
 atomicMax(&state.far,atomicLoad(&far));
 atomicAdd(&state.visible,atomicLoad(&visible));
 }
-}`,X=`${_}
-struct State{${$.replace(/NUMBER/g,"u32")}}
+}`,X=`${F}
+struct State{${q.replace(/NUMBER/g,"u32")}}
 override FIRST:bool;
 @group(0)@binding(0)var<uniform>view:View;
 @group(0)@binding(1)var<storage,read>state:State;
@@ -224,10 +234,10 @@ return min(u32((far-bitcast<f32>(key))*(65535/max(far-near,1e-20))),65534);
 
 fn digitOf(key:u32)->u32{return select(key>>8,key&255,FIRST);}
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn count(@builtin(workgroup_id)group:vec3u,@builtin(local_invocation_index)thread:u32){
-for(var round=0u;round<${b/y};round++){
-let i=group.x*${b}+round*${y}+thread;
+for(var round=0u;round<${w/g};round++){
+let i=group.x*${w}+round*${g}+thread;
 if(i<view.count){atomicAdd(&counts[digitOf(keyOf(i))],1);}
 }
 workgroupBarrier();
@@ -235,9 +245,9 @@ starts[group.x*256+thread]=atomicLoad(&counts[thread]);
 }
 
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn scan(@builtin(local_invocation_index)thread:u32){
-let end=(view.count+${b-1})/${b}*256;
+let end=(view.count+${w-1})/${w}*256;
 var sum=0u;
 for(var k=thread;k<end;k+=256){sum+=starts[k];}
 sums[thread]=sum;
@@ -251,14 +261,14 @@ before+=here;
 }
 }
 
-@compute @workgroup_size(${y})
+@compute @workgroup_size(${g})
 fn scatter(@builtin(workgroup_id)group:vec3u,@builtin(local_invocation_index)thread:u32){
 let word=thread>>5;let bit=1u<<(thread&31);
 sums[thread]=starts[group.x*256+thread];
-for(var round=0u;round<${b/y};round++){
+for(var round=0u;round<${w/g};round++){
 for(var k=thread*8;k<thread*8+8;k++){atomicStore(&masks[k],0);}
 workgroupBarrier();
-let i=group.x*${b}+round*${y}+thread;let valid=i<view.count;
+let i=group.x*${w}+round*${g}+thread;let valid=i<view.count;
 var key=0u;var digit=0u;
 if(valid){
 key=keyOf(i);
@@ -277,7 +287,7 @@ orderOut[to]=i;
 workgroupBarrier();
 for(var k=thread*8;k<thread*8+8;k++){sums[thread]+=countOneBits(atomicLoad(&masks[k]));}
 }
-}`,H=`${_}${D}
+}`,W=`${F}${V}
 @group(0)@binding(0)var<uniform>view:View;
 @group(0)@binding(1)var<storage,read>splats:array<Splat>;
 @group(0)@binding(2)var<storage,read>order:array<u32>;
@@ -302,7 +312,7 @@ let power=c.place.w-dot(r,r);
 if(power<-7.9943533){discard;}
 let alpha=min(exp2(power),0.999);
 return vec4f(c.color*alpha,alpha);
-}`,q=`${_}
+}`,Y=`${F}
 @group(0)@binding(0)var<uniform>view:View;
 @group(0)@binding(1)var picture:texture_2d<f32>;
 
@@ -314,4 +324,4 @@ return vec4f(vec2f(f32(vertex&1),f32(vertex>>1))*4.-1.,0,1);
 var c=textureLoad(picture,vec2i(at.xy),0);
 c+=(1.-c.a)*view.background;
 return vec4f(clamp(c.rgb,vec3f(0),vec3f(c.a)),c.a);
-}`;var j=8,k=class{constructor(e,r,a,t,o){this.memory=e;this.changes=[];let{rig:s,faces:u,changes:c}=r,i=r.face_index.length,l=u.length/3;this.points=e.storage(s.template.length),this.told=new Float32Array(j+E),this.pose=e.uniform(this.told.length);let d=new Uint32Array(this.told.buffer);if(d[0]=i,d[1]=l,this.frames=this.step(z,l,[this.pose,this.points,e.storage(u),a.frames]),!c)return;if(c.directions.length/c.rest.length>E)throw new x(`has more than ${E} activations`);let{basis:f,columns:g}=oe(c,i);d[2]=g;let p=[t,o].map(v=>e.storage(v));this.changes.push(this.step(O,i,[this.pose,...p,e.storage(f),a.means,a.colors])),c.features&&this.addNetwork(c.features,i,a.colors)}run(e){let{device:r}=this.memory;this.memory.write(this.points,e.points);let a=r.createCommandEncoder(),t=a.beginComputePass(),o=[this.frames];e.changed&&(this.told.set(e.activations,j),o.push(...this.changes)),this.memory.write(this.pose,this.told);for(let{pipeline:s,group:u,threads:c}of o)w(t,s,u,Math.ceil(c/y));t.end(),r.queue.submit([a.finish()])}addNetwork(e,r,a){let{memory:t}=this,{width:o,rank:s,hidden:u}=M(e,r),{weights:c,biases:i}=e,l=Math.ceil(o/4),d=4*Math.ceil(u/4),f=c[0].length/u,g=new Float32Array(4*(l+1)*d);for(let m=0;m<u;++m){let A=4*(l+1)*m;g.set(c[0].subarray(m*f,m*f+o),A);for(let T=0;T<4;++T)g[A+4*l+T]=c[1][T*u+m]}this.told.set(i[1],4);let p=(m,A)=>t.storage(ne(se(m,A))),v=p(C(e,r,o),u),h=[p(e.neutral,o),p(e.basis,o),v,t.storage(g)];this.changes.push(this.step(I(l,s,d),r,[this.pose,...h,a]))}step(e,r,a){let{device:t}=this.memory,o=t.createComputePipeline({layout:"auto",compute:{module:t.createShaderModule({code:e})}});return{pipeline:o,group:this.memory.group(o.getBindGroupLayout(0),a),threads:r}}};function oe({means:n,opacity_logits:e,color:r},a){let t=[{part:n,width:3,at:0},{part:e,width:1,at:3},{part:r,width:3,at:4}],o=(c,i)=>(c?.length??0)/i/Math.max(a,1),s=Math.max(...t.map(({part:c,width:i})=>o(c,i))),u=new Float32Array(8*a*s);for(let{part:c,width:i,at:l}of t){let d=o(c,i);for(let f=0,g=0;f<a;++f)for(let p=0;p<i;++p)for(let v=0;v<d;++v)u[8*(f*s+v)+l+p]=c[g++]}return{basis:u,columns:s}}function se(n,e){let r=4*Math.ceil(e/4),a=n.length/e;if(r===e)return n;let t=new Float32Array(a*r);for(let o=0;o<a;++o)t.set(n.subarray(o*e,(o+1)*e),o*r);return t}function ne(n){if(typeof Float16Array>"u")throw new x("needs half floats, which this browser's WebGPU lacks");return new Uint32Array(new Float16Array(n).buffer)}var R=class{constructor(e){let r=["uniform",...Array(3).fill("read-only-storage"),...Array(3).fill("storage")];this.layout=e.createBindGroupLayout({entries:r.map((o,s)=>({binding:s,visibility:GPUShaderStage.COMPUTE,buffer:{type:o}}))});let a=e.createPipelineLayout({bindGroupLayouts:[this.layout]}),t=e.createShaderModule({code:X});this.digits=[1,0].map(o=>{let s=u=>e.createComputePipeline({layout:a,compute:{module:t,entryPoint:u,constants:{FIRST:o}}});return{count:s("count"),scan:s("scan"),scatter:s("scatter")}})}},U=class{constructor(e,r,a,t,o){this.pipelines=e;this.count=a;let[s,u,c,i]=Array.from({length:4},()=>r.storage(a)),l=r.storage(256*Math.ceil(a/b)),d=[[s,u,c,i],[c,i,s,u]];this.groups=d.map(f=>r.group(e.layout,[t,o,...f,l])),[this.keys,this.order]=[s,u]}run(e){let r=Math.ceil(this.count/b);this.pipelines.digits.forEach(({count:a,scan:t,scatter:o},s)=>{let u=this.groups[s];w(e,a,u,r),w(e,t,u,1),w(e,o,u,r)})}};function G(n,e){for(let r=0,a=0;r<n.length;r+=3,a+=4)e[a]=n[r],e[a+1]=n[r+1],e[a+2]=n[r+2]}var K="rgba16float",W=36,Y=Uint32Array.of(4294967295,0,4,0,0,0),ie=8,B=class{constructor(e,r){this.device=e;this.format=r;let a=s=>e.createShaderModule({code:s});this.project=e.createComputePipeline({layout:"auto",compute:{module:a(V)}}),this.sort=new R(e);let t={srcFactor:"one",dstFactor:"one-minus-src-alpha"},o=(s,u,c)=>{let i=a(s);return e.createRenderPipeline({layout:"auto",vertex:{module:i},fragment:{module:i,targets:[u]},primitive:{topology:c}})};this.draw=o(H,{format:K,blend:{color:t,alpha:t}},"triangle-strip"),this.screen=o(q,{format:r},"triangle-list")}},F=class{constructor(e,r,a,t){this.pipelines=e;this.context=r;this.poser=t;this.picture=null;this.screen=null;let{device:o}=e,{attributes:s}=a.baked,{bound:u,faceIndex:c}=t,i=this.memory=new P(o),l=this.count=c.length;this.shRest=s.sh.length/3/Math.max(l,1)-1,[this.means,this.colors,this.shapeValues]=[4,4,8].map(h=>new Float32Array(h*l)),c.forEach((h,m)=>this.means[4*m+3]=h),G(t.means,this.means);for(let h=0;h<l;++h){let m=3*h*(1+this.shRest);this.colors.set([...s.sh.subarray(m,m+3),s.opacity_logits[h]],4*h)}let d=new Float32Array(4*l*this.shRest);for(let h=0;h<l*this.shRest;++h){let m=3*(h+Math.floor(h/this.shRest)+1);d.set(s.sh.subarray(m,m+3),4*h)}let f=this.posed={frames:i.storage(t.frames.length),means:i.storage(this.means),colors:i.storage(this.colors)};this.shapes=i.storage(8*l),this.view=i.uniform(W),this.state=i.indirect(Y),this.sorter=new U(e.sort,i,l,this.view,this.state);let g=i.storage(12*l),p=this.sorter,v=[f.frames,f.means,this.shapes,f.colors,i.storage(d)];this.project=i.group(e.project.getBindGroupLayout(0),[this.view,...v,g,p.keys,this.state]),this.splats=i.group(e.draw.getBindGroupLayout(0),[this.view,g,p.order]),this.uploadShapes(s.quats,s.log_scales.map(Math.exp)),this.gpuPoser=u&&new k(i,u,f,this.means,this.colors),r.configure({device:o,format:e.format,alphaMode:"premultiplied"})}upload(){let{gpuPoser:e,poser:r}=this;e?.run(r),r.free&&this.uploadPosed(r,r.free)}draw(e,r,a){let{pipelines:t,count:o}=this,{device:s}=t,[u,c,i,l]=a,d=r.directions,f=new Float32Array(W);f.set(r.head),f.set([d[0],d[1],d[2],0,d[3],d[4],d[5],0,d[6],d[7],d[8]],12),f.set([...r.focal,...r.centre,r.width,r.height],24),new Uint32Array(f.buffer).set([o,this.shRest],30),f.set([u*l,c*l,i*l,l],32),this.memory.write(this.view,f),this.memory.write(this.state,Y);let g=s.createCommandEncoder(),p=g.beginComputePass();w(p,t.project,this.project,Math.ceil(o/y)),this.sorter.run(p),p.end();let v=this.pictureOf(r.width,r.height);this.render(g,v.createView(),t.draw,this.splats,h=>h.drawIndirect(this.state,ie)),this.render(g,this.context.getCurrentTexture().createView(),t.screen,this.screen,h=>h.draw(3)),s.queue.submit([g.finish()])}dispose(){this.picture?.destroy(),this.memory.free()}render(e,r,a,t,o){let s=e.beginRenderPass({colorAttachments:[{view:r,loadOp:"clear",storeOp:"store"}]});s.setPipeline(a),s.setBindGroup(0,t),o(s),s.end()}pictureOf(e,r){let{pipelines:a}=this,{device:t}=a;if(this.picture?.width===e&&this.picture.height===r)return this.picture;this.picture?.destroy();let{RENDER_ATTACHMENT:o,TEXTURE_BINDING:s}=GPUTextureUsage,u=this.picture=t.createTexture({size:[e,r],format:K,usage:o|s});return this.screen=t.createBindGroup({layout:a.screen.getBindGroupLayout(0),entries:[{binding:0,resource:{buffer:this.view}},{binding:1,resource:u.createView()}]}),u}uploadPosed(e,r){let{memory:a,posed:t,means:o,colors:s}=this;G(e.means,o),G(e.colors,s),e.opacityLogits.forEach((u,c)=>s[4*c+3]=u),a.write(t.frames,e.frames),a.write(t.means,o),a.write(t.colors,s),this.uploadShapes(r.quats,r.scales)}uploadShapes(e,r){let{shapeValues:a}=this;for(let t=0;t<this.count;++t){for(let o=0;o<4;++o)a[8*t+o]=e[4*t+o];for(let o=0;o<3;++o)a[8*t+4+o]=r[3*t+o]}this.memory.write(this.shapes,a)}};async function ue(n="auto"){if(n!=="webgl2")try{let e=await ce(n),r=e.lost;e.pushErrorScope("validation");let a=new B(e,navigator.gpu.getPreferredCanvasFormat()),t=await e.popErrorScope();if(t)throw new Error(t.message);return(...o)=>new L(a,r,...o)}catch(e){J(e.message);return}}var J=n=>console.warn(`mien: ${n}; WebGL2 draws instead`);async function ce(n){if(!navigator.gpu)throw new Error("this browser has no WebGPU, or the page has no secure address");let e=await navigator.gpu.requestAdapter({powerPreference:"high-performance"});if(!e)throw new Error("WebGPU has no adapter here");if(n==="auto"&&e.info.isFallbackAdapter)throw new Error("WebGPU has an adapter in software only");let{maxStorageBufferBindingSize:r,maxBufferSize:a}=e.limits;return e.requestDevice({requiredLimits:{maxStorageBufferBindingSize:r,maxBufferSize:a}})}var L=class{constructor(e,r,a,t,o,s,u){this.hidden=new OffscreenCanvas(1,1);this.disposed=!1;this.screen=a.getContext("2d");let c=i=>{J(i),o.binds=!0,o.activations.fill(NaN);let l=this.hidden=new OffscreenCanvas(1,1);return l.addEventListener("webglcontextlost",d=>d.preventDefault()),l.addEventListener("webglcontextrestored",()=>{this.drawer=new u(l,t,o),s()}),new u(l,t,o)};o.binds=!1;try{this.drawer=new F(e,this.hidden.getContext("webgpu"),t,o)}catch(i){this.drawer=c(`this avatar ${i.message}`);return}r.then(({message:i})=>{this.disposed||(this.drawer=c(`the WebGPU device is lost (${i.trim()||"no reason is given"})`),s())}).catch(i=>console.error(`mien: ${i.message}`))}upload(){this.drawer.upload()}draw(e,r,a){let{hidden:t,screen:o}=this,{width:s,height:u}=r;(t.width!==s||t.height!==u)&&([t.width,t.height]=[s,u]),this.drawer.draw(e,r,a),o.globalCompositeOperation="copy",o.drawImage(t,0,0)}dispose(){this.disposed=!0,this.drawer.dispose()}};return ae(le);})();
+}`;var K=8,P=class{constructor(e,r,t,a,o){this.memory=e;this.changes=[];let{rig:n,faces:u,changes:l}=r,i=r.face_index.length,c=u.length/3;this.points=e.storage(n.template.length),this.told=new Float32Array(K+E),this.pose=e.uniform(this.told.length);let f=new Uint32Array(this.told.buffer);if(f[0]=i,f[1]=c,this.frames=this.step(D,c,[this.pose,this.points,e.storage(u),t.frames]),!l)return;let{regions:h,width:m}=z(l,c);if(h*m>E)throw new A(`has more than ${E} activations`);let p=e.storage(l.shares??new Float32Array(c).fill(1)),{basis:y,columns:d}=ie(l,i);f[2]=d;let v=[a,o].map(b=>e.storage(b));this.changes.push(this.step($(h,m),i,[this.pose,...v,e.storage(y),t.means,t.colors,p])),l.features&&this.addNetwork(l.features,i,h,[t.colors,p,t.means])}run(e){let{device:r}=this.memory;this.memory.write(this.points,e.points);let t=r.createCommandEncoder(),a=t.beginComputePass(),o=[this.frames];e.changed&&(this.told.set(e.activations,K),o.push(...this.changes)),this.memory.write(this.pose,this.told);for(let{pipeline:n,group:u,threads:l}of o)x(a,n,u,Math.ceil(l/g));a.end(),r.queue.submit([t.finish()])}addNetwork(e,r,t,a){let{memory:o}=this,{width:n,rank:u,hidden:l}=I(e,r),{weights:i,biases:c}=e,f=Math.ceil(n/4),h=4*Math.ceil(l/4),m=i[0].length/l,p=new Float32Array(4*(f+1)*h);for(let b=0;b<l;++b){let T=4*(f+1)*b;p.set(i[0].subarray(b*m,b*m+n),T);for(let _=0;_<4;++_)p[T+4*f+_]=i[1][_*l+b]}this.told.set(c[1],4);let y=(b,T)=>o.storage(ue(le(b,T))),d=y(C(e,r,n),l),v=[y(e.neutral,n),y(e.basis,n),d,o.storage(p)];this.changes.push(this.step(j(f,u,h,t),r,[this.pose,...v,...a]))}step(e,r,t){let{device:a}=this.memory,o=a.createComputePipeline({layout:"auto",compute:{module:a.createShaderModule({code:e})}});return{pipeline:o,group:this.memory.group(o.getBindGroupLayout(0),t),threads:r}}};function ie({means:s,opacity_logits:e,color:r},t){let a=[{part:s,width:3,at:0},{part:e,width:1,at:3},{part:r,width:3,at:4}],o=(l,i)=>(l?.length??0)/i/Math.max(t,1),n=Math.max(...a.map(({part:l,width:i})=>o(l,i))),u=new Float32Array(8*t*n);for(let{part:l,width:i,at:c}of a){let f=o(l,i);for(let h=0,m=0;h<t;++h)for(let p=0;p<i;++p)for(let y=0;y<f;++y)u[8*(h*n+y)+c+p]=l[m++]}return{basis:u,columns:n}}function le(s,e){let r=4*Math.ceil(e/4),t=s.length/e;if(r===e)return s;let a=new Float32Array(t*r);for(let o=0;o<t;++o)a.set(s.subarray(o*e,(o+1)*e),o*r);return a}function ue(s){if(typeof Float16Array>"u")throw new A("needs half floats, which this browser's WebGPU lacks");return new Uint32Array(new Float16Array(s).buffer)}var R=class{constructor(e){let r=["uniform",...Array(3).fill("read-only-storage"),...Array(3).fill("storage")];this.layout=e.createBindGroupLayout({entries:r.map((o,n)=>({binding:n,visibility:GPUShaderStage.COMPUTE,buffer:{type:o}}))});let t=e.createPipelineLayout({bindGroupLayouts:[this.layout]}),a=e.createShaderModule({code:X});this.digits=[1,0].map(o=>{let n=u=>e.createComputePipeline({layout:t,compute:{module:a,entryPoint:u,constants:{FIRST:o}}});return{count:n("count"),scan:n("scan"),scatter:n("scatter")}})}},U=class{constructor(e,r,t,a,o){this.pipelines=e;this.count=t;let[n,u,l,i]=Array.from({length:4},()=>r.storage(t)),c=r.storage(256*Math.ceil(t/w)),f=[[n,u,l,i],[l,i,n,u]];this.groups=f.map(h=>r.group(e.layout,[a,o,...h,c])),[this.keys,this.order]=[n,u]}run(e){let r=Math.ceil(this.count/w);this.pipelines.digits.forEach(({count:t,scan:a,scatter:o},n)=>{let u=this.groups[n];x(e,t,u,r),x(e,a,u,1),x(e,o,u,r)})}};function G(s,e){for(let r=0,t=0;r<s.length;r+=3,t+=4)e[t]=s[r],e[t+1]=s[r+1],e[t+2]=s[r+2]}var Q="rgba16float",J=36,Z=Uint32Array.of(4294967295,0,4,0,0,0),ce=8,B=class{constructor(e,r){this.device=e;this.format=r;let t=n=>e.createShaderModule({code:n});this.project=e.createComputePipeline({layout:"auto",compute:{module:t(H)}}),this.sort=new R(e);let a={srcFactor:"one",dstFactor:"one-minus-src-alpha"},o=(n,u,l)=>{let i=t(n);return e.createRenderPipeline({layout:"auto",vertex:{module:i},fragment:{module:i,targets:[u]},primitive:{topology:l}})};this.draw=o(W,{format:Q,blend:{color:a,alpha:a}},"triangle-strip"),this.screen=o(Y,{format:r},"triangle-list")}},M=class{constructor(e,r,t,a){this.pipelines=e;this.context=r;this.poser=a;this.picture=null;this.screen=null;let{device:o}=e,{attributes:n}=t.baked,{bound:u,faceIndex:l}=a,i=this.memory=new k(o),c=this.count=l.length;this.shRest=n.sh.length/3/Math.max(c,1)-1,[this.means,this.colors,this.shapeValues]=[4,4,8].map(d=>new Float32Array(d*c)),l.forEach((d,v)=>this.means[4*v+3]=d),G(a.means,this.means);for(let d=0;d<c;++d){let v=3*d*(1+this.shRest);this.colors.set([...n.sh.subarray(v,v+3),n.opacity_logits[d]],4*d)}let f=new Float32Array(4*c*this.shRest);for(let d=0;d<c*this.shRest;++d){let v=3*(d+Math.floor(d/this.shRest)+1);f.set(n.sh.subarray(v,v+3),4*d)}let h=this.posed={frames:i.storage(a.frames.length),means:i.storage(this.means),colors:i.storage(this.colors)};this.shapes=i.storage(8*c),this.view=i.uniform(J),this.state=i.indirect(Z),this.sorter=new U(e.sort,i,c,this.view,this.state);let m=i.storage(12*c),p=this.sorter,y=[h.frames,h.means,this.shapes,h.colors,i.storage(f)];this.project=i.group(e.project.getBindGroupLayout(0),[this.view,...y,m,p.keys,this.state]),this.splats=i.group(e.draw.getBindGroupLayout(0),[this.view,m,p.order]),this.uploadShapes(n.quats,n.log_scales.map(Math.exp)),this.gpuPoser=u&&new P(i,u,h,this.means,this.colors),r.configure({device:o,format:e.format,alphaMode:"premultiplied"})}upload(){let{gpuPoser:e,poser:r}=this;e?.run(r),r.free&&this.uploadPosed(r,r.free)}draw(e,r,t){let{pipelines:a,count:o}=this,{device:n}=a,[u,l,i,c]=t,f=r.directions,h=new Float32Array(J);h.set(r.head),h.set([f[0],f[1],f[2],0,f[3],f[4],f[5],0,f[6],f[7],f[8]],12),h.set([...r.focal,...r.centre,r.width,r.height],24),new Uint32Array(h.buffer).set([o,this.shRest],30),h.set([u*c,l*c,i*c,c],32),this.memory.write(this.view,h),this.memory.write(this.state,Z);let m=n.createCommandEncoder(),p=m.beginComputePass();x(p,a.project,this.project,Math.ceil(o/g)),this.sorter.run(p),p.end();let y=this.pictureOf(r.width,r.height);this.render(m,y.createView(),a.draw,this.splats,d=>d.drawIndirect(this.state,ce)),this.render(m,this.context.getCurrentTexture().createView(),a.screen,this.screen,d=>d.draw(3)),n.queue.submit([m.finish()])}dispose(){this.picture?.destroy(),this.memory.free()}render(e,r,t,a,o){let n=e.beginRenderPass({colorAttachments:[{view:r,loadOp:"clear",storeOp:"store"}]});n.setPipeline(t),n.setBindGroup(0,a),o(n),n.end()}pictureOf(e,r){let{pipelines:t}=this,{device:a}=t;if(this.picture?.width===e&&this.picture.height===r)return this.picture;this.picture?.destroy();let{RENDER_ATTACHMENT:o,TEXTURE_BINDING:n}=GPUTextureUsage,u=this.picture=a.createTexture({size:[e,r],format:Q,usage:o|n});return this.screen=a.createBindGroup({layout:t.screen.getBindGroupLayout(0),entries:[{binding:0,resource:{buffer:this.view}},{binding:1,resource:u.createView()}]}),u}uploadPosed(e,r){let{memory:t,posed:a,means:o,colors:n}=this;G(e.means,o),G(e.colors,n),e.opacityLogits.forEach((u,l)=>n[4*l+3]=u),t.write(a.frames,e.frames),t.write(a.means,o),t.write(a.colors,n),this.uploadShapes(r.quats,r.scales)}uploadShapes(e,r){let{shapeValues:t}=this;for(let a=0;a<this.count;++a){for(let o=0;o<4;++o)t[8*a+o]=e[4*a+o];for(let o=0;o<3;++o)t[8*a+4+o]=r[3*a+o]}this.memory.write(this.shapes,t)}};async function fe(s="auto"){if(s!=="webgl2")try{let e=await he(s),r=e.lost;e.pushErrorScope("validation");let t=new B(e,navigator.gpu.getPreferredCanvasFormat()),a=await e.popErrorScope();if(a)throw new Error(a.message);return(...o)=>new L(t,r,...o)}catch(e){ee(e.message);return}}var ee=s=>console.warn(`mien: ${s}; WebGL2 draws instead`);async function he(s){if(!navigator.gpu)throw new Error("this browser has no WebGPU, or the page has no secure address");let e=await navigator.gpu.requestAdapter({powerPreference:"high-performance"});if(!e)throw new Error("WebGPU has no adapter here");if(s==="auto"&&e.info.isFallbackAdapter)throw new Error("WebGPU has an adapter in software only");let{maxStorageBufferBindingSize:r,maxBufferSize:t}=e.limits;return e.requestDevice({requiredLimits:{maxStorageBufferBindingSize:r,maxBufferSize:t}})}var L=class{constructor(e,r,t,a,o,n,u){this.hidden=new OffscreenCanvas(1,1);this.disposed=!1;this.screen=t.getContext("2d");let l=i=>{ee(i),o.binds=!0,o.activations.fill(NaN);let c=this.hidden=new OffscreenCanvas(1,1);return c.addEventListener("webglcontextlost",f=>f.preventDefault()),c.addEventListener("webglcontextrestored",()=>{this.drawer=new u(c,a,o),n()}),new u(c,a,o)};o.binds=!1;try{this.drawer=new M(e,this.hidden.getContext("webgpu"),a,o)}catch(i){this.drawer=l(`this avatar ${i.message}`);return}r.then(({message:i})=>{this.disposed||(this.drawer=l(`the WebGPU device is lost (${i.trim()||"no reason is given"})`),n())}).catch(i=>console.error(`mien: ${i.message}`))}upload(){this.drawer.upload()}draw(e,r,t){let{hidden:a,screen:o}=this,{width:n,height:u}=r;(a.width!==n||a.height!==u)&&([a.width,a.height]=[n,u]),this.drawer.draw(e,r,t),o.globalCompositeOperation="copy",o.drawImage(a,0,0)}dispose(){this.disposed=!0,this.drawer.dispose()}};return se(de);})();
