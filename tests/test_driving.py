@@ -10,6 +10,7 @@ import torch
 
 from known import known
 from mien.avatar import neutral_of
+from mien.avatar.resting import at_rest
 from mien.camera import camera_from_fov
 from mien.capture.capture import Capture
 from mien.capture.quality import frame_rate, pace_report
@@ -60,6 +61,17 @@ def test_driving_an_avatar_with_itself_changes_nothing() -> None:
     talking.expression[40:60] = rest
     talking.expression[70] = 50.0
     torch.testing.assert_close(neutral_of(talking).expression, rest[None])
+
+
+def test_the_person_at_rest_has_closed_lips_and_open_eyes() -> None:
+    """All frames part the lips, and the calmest ones blink. What belongs to the person stays."""
+    model = load_face_model("anny")
+    jaw, brow, blink = (model.expression_names.index(name) for name in ("jawOpen", "browInnerUp", "eyeBlinkLeft"))
+    face = model.neutral(40)
+    face.expression[:, jaw], face.expression[:, brow] = torch.linspace(0.2, 0.5, 40), 0.2
+    face.expression[:4, blink] = 0.2
+    rest = at_rest(face, model).expression[0]
+    assert [float(rest[each]) for each in (jaw, brow, blink)] == pytest.approx([0.0, 0.2, 0.0], abs=0.02)
 
 
 def test_motion_is_done_in_the_avatars_own_frame() -> None:

@@ -275,7 +275,10 @@ def drawn_head(
         changes = runtime.ExpressionChanges(
             rest, normal(inputs, own), normal(7, own), *parts, network, columns, shares, head
         )
-        filmed = runtime.Filmed(rest, rest + 1, np.zeros((2, 2), np.float32))
+        highest = rest + 1
+        for name, most in (("mouthPucker", 0), ("browDownLeft", 0.2)):
+            highest[portable.expression_names.index(name)] = rest[portable.expression_names.index(name)] + most
+        filmed = runtime.Filmed(rest, highest, np.zeros((2, 2), np.float32))
     face_index = random.integers(0, len(baked.faces), count).astype(np.int32)
     baked = replace(
         baked, face_index=face_index, means=some(0.2, 3), attributes=attributes, sh_frame=sh_frame, changes=changes
