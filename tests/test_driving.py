@@ -67,9 +67,8 @@ def test_the_person_at_rest_has_closed_lips_and_open_eyes() -> None:
     """All frames part the lips, and the calmest ones blink. What belongs to the person stays."""
     model = load_face_model("anny")
     jaw, brow, blink = (model.expression_names.index(name) for name in ("jawOpen", "browInnerUp", "eyeBlinkLeft"))
-    face = model.neutral(40)
-    face.expression[:, jaw], face.expression[:, brow] = torch.linspace(0.2, 0.5, 40), 0.2
-    face.expression[:4, blink] = 0.2
+    face, value = (many := model.neutral(40)), many.expression
+    value[:, jaw], value[:, brow], value[:4, blink] = torch.linspace(0.2, 0.5, 40), 0.2, 0.2
     rest = at_rest(face, model).expression[0]
     assert [float(rest[each]) for each in (jaw, brow, blink)] == pytest.approx([0.0, 0.2, 0.0], abs=0.02)
 
