@@ -211,9 +211,13 @@ def test_every_expression_has_a_tile_whose_strength_is_relative_to_what_was_film
     tiles = sheets.filmed_tiles(model, model.neutral(), CAMERA, filmed, 1.5)
     shown = [float(tile.face.expression.max()) for tile in tiles[1:]]
     assert shown == pytest.approx([min(1.5 * value, 1.0) for value in highest[:count][::-1].tolist()])
-    tiles = sheets.preset_tiles(load_face_model("anny"), face, CAMERA, torch.zeros(3))
+    anny = load_face_model("anny")
+    blinks = np.array([0.6 if name == "eyeBlinkLeft" else 0.3 for name in anny.expression_names], np.float32)
+    tiles = sheets.preset_tiles(anny, face, CAMERA, torch.zeros(3), Filmed(0 * blinks, blinks, filmed.head_angles))
     assert [tile.name for tile in tiles[::14]] == ["as it is", "as it is, aside"]
-    assert float(tiles[1].face.expression.max()) == pytest.approx(0.7), "a smile"
+    smile, shut = (tiles[index].face.expression[0] for index in (1, 12))
+    assert float(smile.max()) == pytest.approx(0.7)
+    assert sorted(shut[shut > 0].tolist()) == pytest.approx([0.6, 1.0]), "only the left lids were filmed shut"
     assert not torch.equal(tiles[14].camera.viewmat, CAMERA.viewmat)
     face, center = make_small_face_model().neutral(), torch.zeros(3)
     tiles, around = (sheets.turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))

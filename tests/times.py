@@ -27,7 +27,6 @@ THEMES = {
     "docs, settings, presets": "docs|settings|paper_preset|release|seams",
     "training, avatars, rasterizer": "",
 }
-"""Theme -> pattern of the names of its files; the first that fits counts."""
 _starts = [0]
 
 
@@ -42,8 +41,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     began, computed, starts = time.monotonic(), time.process_time(), _starts[0]
     yield
     wall, own = time.monotonic() - began, time.process_time() - computed
+    started = _starts[0] - starts
     with Path(os.environ["MIEN_TEST_TIMES"]).open("a") as file:
-        started = _starts[0] - starts
         file.write(json.dumps([item.nodeid, wall, max(wall - own, 0) if started else 0, started]) + "\n")
 
 
@@ -58,9 +57,7 @@ def main(path: str) -> None:
     print("| theme | tests | s | of this, waiting for processes | processes |\n|---|---|---|---|---|")
     for theme, (count, wall, waits, starts) in sorted(sums.items(), key=lambda entry: -entry[1][1]):
         print(f"| {theme} | {count:,.0f} | {wall:,.0f} | {waits:,.0f} | {starts:,.0f} |")
-    print()
-    for name, wall, *_ in sorted(rows, key=lambda row: -row[1])[:20]:
-        print(f"{wall:6.1f} s  {name}")
+    print(*(f"\n{wall:6.1f} s  {name}" for name, wall, *_ in sorted(rows, key=lambda row: -row[1])[:20]), sep="")
 
 
 if __name__ == "__main__":

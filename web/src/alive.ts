@@ -1,6 +1,7 @@
 // Signs of life: blinks, a head that is never quite still, and eyes that follow the pointer.
 
 import type { Avatar, Face } from "./avatar";
+import { highestOf } from "./named";
 import { axisAngle, multiplied, rotationMatrix } from "./rigid";
 
 /** Mean time between blinks, and the times to close and to open, in seconds. */
@@ -39,7 +40,7 @@ export interface Life {
 
 /** Adds signs of life to a face: blinks, a head that is never quite still, and eyes that look aside. */
 export function enliven(face: Face, avatar: Avatar, life: Life, seconds: number): void {
-  const { expression_names: names, expression_bounds: bounds, joint_names: joints } = avatar;
+  const { expression_names: names, joint_names: joints } = avatar;
   /** Turns an axis-angle vector further. */
   const turn = (vectors: Float32Array, at: number, by: number[]) =>
     vectors.set(axisAngle(multiplied(rotationMatrix(vectors, at), rotationMatrix(by, 0))), at);
@@ -48,7 +49,7 @@ export function enliven(face: Face, avatar: Avatar, life: Life, seconds: number)
     const blink = blinkAt(seconds);
     for (const name of ["eyeBlinkLeft", "eyeBlinkRight"]) {
       const e = names.indexOf(name), open = face.expression[e];
-      if (e >= 0) face.expression[e] = open + Math.max(Math.min(1, bounds[2 * e + 1]) - open, 0) * blink;
+      if (e >= 0) face.expression[e] = open + Math.max(Math.min(1, highestOf(avatar, name, e)) - open, 0) * blink;
     }
     turn(face.head_rotation, 0, swayAt(seconds).map((angle, k) => angle + HEAD_SHARE * [-MOST_GAZE[1] * up, MOST_GAZE[0] * right, 0][k]));
   }

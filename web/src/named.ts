@@ -44,9 +44,19 @@ export function rangeOf(avatar: Avatar, name: string): [number, number] | undefi
 export function beyondFilmed({ filmed, neutral, expression_names }: Avatar, name: string): number {
   const over = Object.entries(presets[name]).map(([part, value]) => {
     const index = expression_names.indexOf(part);
-    return filmed && index >= 0 ? neutral.expression[index] + value - filmed.highest[index] : 0;
+    const shut = part.startsWith("eyeBlink") && filmed && filmed.highest[index] >= SHUT;
+    return filmed && index >= 0 && !shut ? neutral.expression[index] + value - filmed.highest[index] : 0;
   });
   return Math.max(0, ...over);
+}
+
+/** Coefficient of a blink from which a clip shows the lids shut. A mesh that closes them further tears them. */
+const SHUT = 0.5;
+
+/** The highest value of an expression in presets and blinks: that of a blink is where the person's own lids are shut, if the clip shows it. */
+export function highestOf({ filmed, expression_bounds }: Avatar, name: string, index: number): number {
+  const seen = filmed && name.startsWith("eyeBlink") ? filmed.highest[index] : 0, most = expression_bounds[2 * index + 1];
+  return seen >= SHUT ? Math.min(seen, most) : most;
 }
 
 /**
@@ -64,8 +74,8 @@ export function setNamed(avatar: Avatar, face: Face, look: Map<string, number>, 
   } else if (index >= 0) face.expression[index] = value;
   else
     for (const [part, most] of Object.entries(presets[name])) {
-      const rest = avatar.neutral.expression[avatar.expression_names.indexOf(part)];
-      setNamed(avatar, face, look, part, (eyeOf(avatar, part) ? 0 : rest) + value * most);
+      const index = avatar.expression_names.indexOf(part), rest = avatar.neutral.expression[index];
+      setNamed(avatar, face, look, part, eyeOf(avatar, part) ? value * most : Math.min(rest + value * most, highestOf(avatar, part, index)));
     }
   return true;
 }

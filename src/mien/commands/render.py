@@ -272,7 +272,8 @@ class Sheet(_Look):
         elif self.kind == "filmed":
             tiles = sheets.filmed_tiles(model, face, camera, filmed_range(run_dir, avatar), self.strength)
         elif self.kind == "presets":
-            tiles = sheets.preset_tiles(model, face, camera, avatar.subject.head_translation[0])
+            middle = avatar.subject.head_translation[0]
+            tiles = sheets.preset_tiles(model, face, camera, middle, filmed_range(run_dir, avatar))
         else:
             tiles = sheets.expression_tiles(model, face, camera, self.strength)
         sides = sides_filmed(run_dir, avatar) if self.kind == "turntable" else None

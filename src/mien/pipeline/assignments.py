@@ -29,6 +29,8 @@ class Settable:
     face_model: str
     unit: str = "the full expression"
     """Meaning of the value 1 of an expression."""
+    presets: Sequence[Sequence[float]] | None = None
+    """The bounds for preset faces; None for the same ones."""
 
     @property
     def angles(self) -> tuple[str, ...]:
@@ -63,7 +65,7 @@ def assign(
                 look[part.name] = part.value
                 continue
             index = settable.expressions.index(part.name)
-            lower, upper = settable.bounds[index]
+            lower, upper = (settable.presets or settable.bounds)[index]
             added = (expression[..., index] + part.value).clip(lower, upper)
             set_to[..., index] = added if part.is_added else value
     return set_to, turned_eyes(turned, settable.joints, look) if look else turned

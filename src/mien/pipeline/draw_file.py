@@ -15,6 +15,7 @@ from mien.media.pixels import png_bytes, to_rgb, to_rgba
 from mien.pipeline.assignments import Settable, assign
 from mien.pipeline.picture_options import PictureOptions
 from mien.runtime.camera_paths import fitted, turned, zoom_at_rest
+from mien.runtime.filmed import with_filmed_blinks
 
 
 def render_file(
@@ -36,7 +37,8 @@ def render_file(
     avatar = runtime.load(source)
     portable, rest = avatar.portable, avatar.portable.neutral
     bounds, model = portable.expression_bounds.tolist(), portable.about.face_model
-    settable = Settable(avatar.expression_names, bounds, avatar.joint_names, model)
+    shut = with_filmed_blinks(portable.expression_bounds, avatar.expression_names, portable.filmed)
+    settable = Settable(avatar.expression_names, bounds, avatar.joint_names, model, presets=shut.tolist())
     gaussians = avatar.pose(*assign(assignments, settable, rest.expression, rest.joints))
     center = rest.head_translation.astype(np.float64)
     camera = fitted(avatar.camera, *options.shape(), zoom_at_rest(avatar, options.shape()) if zoom is None else zoom)

@@ -63,7 +63,9 @@ class RunContent(Content):
         """Return the Gaussians with the expression that was asked for, or of the frame."""
         if self._still is not None:
             return self._still
-        return self._posed(with_expression(self._avatar.subject, self._avatar.face_model, self._expression))
+        return self._posed(
+            with_expression(self._avatar.subject, self._avatar.face_model, self._expression, self._avatar.filmed)
+        )
 
     def poses(self) -> "tuple[Iterator[RunContent], float] | None":
         """Return the content in the pose of every frame of the motion, and frames per second."""
@@ -95,7 +97,8 @@ class RunContent(Content):
         driver = open_driver(by, motion.series if own else None, model, neutral=motion.neutral)
         person = rest_of(subject, model, facing(run_camera(self._run_dir).viewmat)).face
         driven = drive(driver.face, driver.at_rest, person, model.expression_bounds, with_head_pose, motion.series)
-        return with_expression(driven[:: motion.every], model, self._expression), driver.fps / motion.every
+        face = with_expression(driven[:: motion.every], model, self._expression, self._avatar.filmed)
+        return face, driver.fps / motion.every
 
     def _posed(self, face: FaceParams) -> Gaussians:
         """The Gaussians of one timestep in the world. The head is at the origin, +y up, +z out of the face."""

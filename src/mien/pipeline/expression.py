@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from mien.avatar.avatar import Avatar
@@ -13,16 +14,22 @@ from mien.face.params import FaceParams
 from mien.machine.progress import say
 from mien.pipeline.assignments import Settable, angle_names, assign
 from mien.runtime.baked import Filmed
+from mien.runtime.filmed import with_filmed_blinks
 from mien.runtime.named import is_gaze, parts_of
 from mien.training.run import filmed_range, read_face_track
 
 
-def with_expression(face: FaceParams, model: FaceModel, assignments: tuple[str, ...]) -> FaceParams:
-    """`face` with expressions and joint angles set by name at every timestep (`mien.pipeline.assignments.assign`)."""
+def with_expression(
+    face: FaceParams, model: FaceModel, assignments: tuple[str, ...], filmed: Filmed | None = None
+) -> FaceParams:
+    """`face` with expressions and joint angles set by name at every timestep (`mien.pipeline.assignments.assign`).
+
+    Presets shut the lids no further than `filmed` shows them shut.
+    """
     if not assignments:
         return face
     before = (face.expression.detach().cpu().numpy(), face.joints.detach().cpu().numpy())
-    expression, joints = assign(assignments, _settable(model), *before)
+    expression, joints = assign(assignments, _settable(model, filmed), *before)
     return replace(
         face,
         expression=torch.from_numpy(expression).to(face.expression),
@@ -49,8 +56,9 @@ def chosen_face(
     check_face_params(model, face, "--motion", "choose a sequence that was tracked with the avatar's face model")
     if not assignments:
         return face
-    face = with_expression(face, model, assignments)
-    tell_of_unfilmed(assignments, face, model, filmed_range(run_dir, avatar))
+    filmed = filmed_range(run_dir, avatar)
+    face = with_expression(face, model, assignments, filmed)
+    tell_of_unfilmed(assignments, face, model, filmed)
     return face
 
 
@@ -73,7 +81,8 @@ def tell_of_unfilmed(assignments: tuple[str, ...], face: FaceParams, model: Face
         say(f"beyond what was filmed, so it may look wrong: {', '.join(beyond)}")
 
 
-def _settable(model: FaceModel) -> Settable:
+def _settable(model: FaceModel, filmed: Filmed | None) -> Settable:
     unit = "the full expression" if model.expression_sigmas is None else "strong, and 0 is the mean face"
     bounds = model.expression_bounds.tolist()
-    return Settable(tuple(model.expression_names), bounds, tuple(model.free_joint_names), model.name, unit)
+    shut = with_filmed_blinks(np.array(bounds), model.expression_names, filmed).tolist()
+    return Settable(tuple(model.expression_names), bounds, tuple(model.free_joint_names), model.name, unit, shut)

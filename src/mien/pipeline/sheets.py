@@ -76,11 +76,13 @@ def filmed_tiles(model: FaceModel, face: FaceParams, camera: Camera, filmed: Fil
     return tiles
 
 
-def preset_tiles(model: FaceModel, face: FaceParams, camera: Camera, center: Float[Tensor, " 3"]) -> list[Tile]:
+def preset_tiles(
+    model: FaceModel, face: FaceParams, camera: Camera, center: Float[Tensor, " 3"], filmed: Filmed
+) -> list[Tile]:
     """The face as given and the preset faces of pages, first as the camera sees them, then from 20 degrees aside."""
     faces = {"as it is": face}
     faces |= {
-        name.replace("_", " "): with_expression(face, model, (f"{name}=1",))
+        name.replace("_", " "): with_expression(face, model, (f"{name}=1",), filmed)
         for name in presets_for(model.expression_names, model.free_joint_names)
     }
     sides = {"": camera, ", aside": orbit(camera, center, math.radians(20))}

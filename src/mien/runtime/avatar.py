@@ -11,6 +11,7 @@ from mien import _native
 from mien.machine.threads import asked_threads
 from mien.runtime.baked import Camera, PortableAvatar
 from mien.runtime.file import read_portable
+from mien.runtime.filmed import with_filmed_blinks
 from mien.runtime.named import Part, is_gaze, parts_of, presets_for, turned_eyes
 from mien.runtime.posing import Face, Gaussians, pose
 from mien.runtime.rotation import compose_rigid
@@ -84,7 +85,8 @@ class Avatar:
 
     def _coefficients(self, named: Mapping[str, float | int]) -> tuple[dict[str, float], dict[str, float]]:
         """Coefficients of expressions, and those of the gaze, that names of expressions, gaze and presets stand for."""
-        names, bounds, rest = list(self.expression_names), self.portable.expression_bounds, self.portable.neutral
+        names, rest = list(self.expression_names), self.portable.neutral
+        bounds = with_filmed_blinks(self.portable.expression_bounds, names, self.portable.filmed)
         shown = presets_for(names, self.joint_names)
         values: dict[str, float] = {}
         look: dict[str, float] = {}

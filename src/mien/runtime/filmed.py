@@ -18,6 +18,8 @@ COMMON = frozenset({
 })  # fmt: skip
 """ARKit's names of what everybody does: a smile, an open mouth, vowels, raised brows, shut eyes. They reach their full
 motion on every avatar: the mesh bends, and the appearance stays near its last filmed state (`ExpressionChanges`)."""
+SHUT = 0.5
+"""Coefficient of a blink from which a clip shows the lids shut. A mesh that closes them further tears them."""
 ROOM = 0.3
 """How far other values get beyond what was filmed, as a share of the filmed distance from the person at rest."""
 LEAST_EXPRESSION = 0.2
@@ -44,6 +46,17 @@ def soft_limits(values: Array, lowest: Array, highest: Array, rest: Array, least
     return out
 
 
+def with_filmed_blinks(
+    bounds: Float[np.ndarray, "e 2"], names: Sequence[str], filmed: Filmed | None
+) -> Float[np.ndarray, "e 2"]:
+    """The bounds of coefficients. Those of blinks end where the person's own lids are shut, if the clip shows that."""
+    found = bounds.copy()
+    for index, name in enumerate(names):
+        if filmed is not None and name.startswith("eyeBlink") and filmed.highest[index] >= SHUT:
+            found[index, 1] = min(found[index, 1], filmed.highest[index])
+    return found
+
+
 def within_filmed_inputs(
     filmed: Filmed,
     inputs: Float[np.ndarray, "t i"],
@@ -61,7 +74,7 @@ def within_filmed_inputs(
     lowest, highest = filmed.lowest.astype(np.float64), filmed.highest.astype(np.float64)
     common = np.flatnonzero([name in COMMON for name in names])
     lowest[common] = np.minimum(lowest[common], bounds[common, 0])
-    highest[common] = np.maximum(highest[common], bounds[common, 1])
+    highest[common] = np.maximum(highest[common], with_filmed_blinks(bounds, names, filmed)[common, 1])
     limited = soft_limits(inputs, lowest, highest, rest.astype(np.float64), least).astype(np.float32)
     # What is inside keeps its bits.
     return np.where(np.abs(limited - inputs) > 1e-6, limited, inputs)
