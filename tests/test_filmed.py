@@ -214,11 +214,10 @@ def test_every_expression_has_a_tile_whose_strength_is_relative_to_what_was_film
     anny = load_face_model("anny")
     blinks = np.array([0.6 if name == "eyeBlinkLeft" else 0.3 for name in anny.expression_names], np.float32)
     tiles = sheets.preset_tiles(anny, face, CAMERA, torch.zeros(3), Filmed(0 * blinks, blinks, filmed.head_angles))
-    assert [tile.name for tile in tiles[::14]] == ["as it is", "as it is, aside"]
     smile, shut = (tiles[index].face.expression[0] for index in (1, 12))
     assert float(smile.max()) == pytest.approx(0.7)
     assert sorted(shut[shut > 0].tolist()) == pytest.approx([0.6, 1.0]), "only the left lids were filmed shut"
-    assert not torch.equal(tiles[14].camera.viewmat, CAMERA.viewmat)
+    assert (tiles[14].name, torch.equal(tiles[14].camera.viewmat, CAMERA.viewmat)) == ("as it is, aside", False)
     face, center = make_small_face_model().neutral(), torch.zeros(3)
     tiles, around = (sheets.turntable_tiles(face, CAMERA, center, span) for span in (120.0, 360.0))
     assert [tile.name for tile in (tiles[0], tiles[4], tiles[-1])] == ["-60 degrees", "as filmed", "+60 degrees"]
