@@ -43,8 +43,8 @@ class _Film:
     head_pose: bool = True
     """By default, the head follows the driver's head. With --no-head-pose it stays still, and only the face moves."""
     unlimited: bool = False
-    """Follow the driver however far. By default, expressions and turns of the head that go beyond what the avatar was
-    filmed in are softened, because it has never seen them."""
+    """Follow the driver however far. By default, turns of the head and rare expressions that go beyond what the avatar
+    was filmed in are softened, because it has never seen them."""
     alone: bool = False
     """Show only the avatar, without the driver's pictures beside it."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
@@ -62,7 +62,8 @@ class Film(_Neutral, _Film, _Drive):
     """
 
     out: Path
-    """Output: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left."""
+    """The film: an .mp4, a .webm, a folder or NAME_%06d.png. If the driver has pictures, they are on the left. A viewer
+    opens without it."""
     sequence: str | None = None
     """Name of the driver's sequence (default: the only one)."""
     fps: float | None = None
