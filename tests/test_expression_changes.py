@@ -106,7 +106,7 @@ def test_regions_share_the_head_smoothly(person: Person) -> None:
 
 
 def test_brows_and_mouth_change_with_their_own_expressions_and_all_with_the_head(person: Person) -> None:
-    """What an expression does not move at all keeps its bytes: activations, colours, opacities and offsets."""
+    """Gaussians that an expression does not move keep the bytes of activations, colours, opacities and offsets."""
     avatar = new_avatar(RANK, person=person, **FEATURES)
     model, rest, face = person[0], avatar.subject, person[1][3]
     shares, inputs = region_shares(model, rest), torch.eye(len(model.expression_names))
@@ -117,7 +117,7 @@ def test_brows_and_mouth_change_with_their_own_expressions_and_all_with_the_head
     assert not motions[neck : neck + 3].any()
 
     def changes(face: FaceParams) -> list[list[Tensor]]:
-        """Of brows, of the mouth, and of what is around the face."""
+        """Return the changes of brows, of the mouth, and of what is around the face."""
         parts = [avatar.activations(face), *avatar.pose(face).aux.values()]
         return [[part[side] for part in parts] for side in sides]
 

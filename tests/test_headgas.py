@@ -9,13 +9,13 @@ from torch import Tensor
 
 from known import known
 from mien.adam import FactoredMoments, Moments
-from mien.avatar.avatar import neutral_of
 from mien.avatar.baking import make_portable
 from mien.avatar.headgas.avatar import HeadGas, input_directions, neighbor_distances, sample_surface, spread_out
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
 from mien.avatar.ops.points import positional_encoding
+from mien.avatar.resting import neutral_of
 from mien.avatar.settings import PerceptualLoss, Photometric, Progress
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams

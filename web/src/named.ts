@@ -41,11 +41,11 @@ export function rangeOf(avatar: Avatar, name: string): [number, number] | undefi
 }
 
 /** How far a preset goes beyond what was filmed, at its coefficient that goes furthest; 0 if nobody knows what was. */
-export function beyondFilmed({ filmed, neutral, expression_names }: Avatar, name: string): number {
+export function beyondFilmed(avatar: Avatar, name: string): number {
+  const { filmed, neutral, expression_names } = avatar;
   const over = Object.entries(presets[name]).map(([part, value]) => {
     const index = expression_names.indexOf(part);
-    const shut = part.startsWith("eyeBlink") && filmed && filmed.highest[index] >= SHUT;
-    return filmed && index >= 0 && !shut ? neutral.expression[index] + value - filmed.highest[index] : 0;
+    return filmed && index >= 0 ? Math.min(neutral.expression[index] + value, highestOf(avatar, part, index)) - filmed.highest[index] : 0;
   });
   return Math.max(0, ...over);
 }

@@ -1,7 +1,6 @@
 from .avatar import Avatar as Avatar
 from .avatar import ParameterGroup as ParameterGroup
 from .avatar import Posed as Posed
-from .avatar import neutral_of as neutral_of
 from .avatar import store_group as store_group
 from .baking import as_array as as_array
 from .baking import bake_rig as bake_rig
@@ -9,6 +8,7 @@ from .files import load_avatar as load_avatar
 from .gaussian_avatars.settings import GaussianAvatarsConfig as GaussianAvatarsConfig
 from .methods import Method as Method
 from .ops.activation import sigmoid as sigmoid
+from .resting import neutral_of as neutral_of
 from .settings import TRAINED as TRAINED
 from .settings import MethodConfig as MethodConfig
 from .settings import Progress as Progress

@@ -7,7 +7,7 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -22,8 +22,6 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, Rendering
 from mien.runtime.baked import BakedAvatar, Filmed
-
-_CALM_SHARE = 0.1  # share of the timesteps that are used to estimate the expression at rest
 
 UNBAKED_REMEDY = "export a .ply instead, or draw it with `mien render`"
 """What to do with avatars that have no record of `mien.runtime`."""
@@ -185,22 +183,3 @@ def frozen(avatar: Avatar) -> Iterator[None]:
     finally:
         for tensor in trained:
             tensor.requires_grad_(True)
-
-
-def neutral_of(face: FaceParams) -> FaceParams:
-    """The person of `face` at rest, as one timestep. A few bad frames do not change this estimate.
-
-    The expression is the median over the tenth of the timesteps with the smallest expression coefficients, measured by
-    their Euclidean norm. What remains in it belongs to the person, for example brows that the tracker always sees
-    raised. Joints and head pose are the medians over all timesteps, because people mostly look towards the camera.
-    """
-    face = face.detach()
-    activity = face.expression.norm(dim=-1)
-    calm = activity.argsort(stable=True)[: max(1, round(_CALM_SHARE * len(face)))]
-    return replace(
-        face,
-        expression=face.expression[calm].median(0, keepdim=True).values,
-        joints=face.joints.median(0, keepdim=True).values,
-        head_rotation=face.head_rotation.median(0, keepdim=True).values,
-        head_translation=face.head_translation.median(0, keepdim=True).values,
-    )

@@ -1,51 +1,69 @@
-"""The person at rest, with closed lips and open eyes also where the calmest frames have neither."""
+"""The face at rest: the calmest frames, and a person with closed lips and open eyes where those have neither."""
 
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 
 _CALM, _CHOSEN = 0.3, 0.1
-"""Share of the timesteps that are calm, and of those among them that have the lips closed and the eyes open."""
+"""Share of the timesteps that are calm, and of those that an expression at rest is estimated from."""
 _MOST_CALM = 200  # timesteps whose meshes are looked at
 _LIPS = ((61, 67), (62, 66), (63, 65))
 _LIDS = ((37, 41), (38, 40), (43, 47), (44, 46))
 """Landmarks of ibug68 above and below each other."""
 
 
+def neutral_of(face: FaceParams) -> FaceParams:
+    """The face of `face` at rest, as one timestep. A few bad frames do not change this estimate.
+
+    The expression is the median over the tenth of the timesteps with the smallest expression coefficients, measured by
+    their Euclidean norm. What remains in it belongs to the person, for example brows that the tracker always sees
+    raised. Joints and head pose are the medians over all timesteps, because people mostly look towards the camera.
+    """
+    return _median_of(face.detach(), _calmest(face, _CHOSEN))
+
+
 @torch.no_grad()
 def at_rest(face: FaceParams, face_model: FaceModel) -> FaceParams:
-    """The person of `face` at rest, as one timestep. A few bad frames do not change this estimate.
+    """`neutral_of` with closed lips and open eyes, also where the calmest frames have neither.
 
-    The expression is a median over a tenth of the timesteps: of the calm ones, those with the smallest coefficients,
-    the ones with closed lips and open eyes. What remains in it belongs to the person, for example brows that the
-    tracker always sees raised. Lips that it leaves parted are closed: what parts them goes back by one share, as far as
-    the face model's own lips are closed. Parted lips at rest would make every driven mouth too wide. Joints and head
-    pose are the medians over all timesteps, because people mostly look towards the camera.
+    Of the calm timesteps, the expression is the median over those with closed lips and open eyes. Lips that it leaves
+    parted are closed: what parts them goes back by one share, as far as the face model's own lips are closed. Parted
+    lips at rest would make every driven mouth too wide. For a face model without the landmarks `ibug68`, it is
+    `neutral_of`.
     """
-    face = face.detach()
-    order = face.expression.norm(dim=-1).argsort(stable=True)
-    calm = order[: max(1, round(_CALM * len(face)))]
+    if "ibug68" not in face_model.landmarks:
+        return neutral_of(face)
+    face, calm = face.detach(), _calmest(face, _CALM)
     calm = calm[:: -(-len(calm) // _MOST_CALM)]
-    if "ibug68" in face_model.landmarks:
-        expressions = torch.cat([torch.zeros_like(face.expression[:1]), face.expression[calm]])
-        lips, lids = _openings(face, face_model, expressions)
-        # Pressed lips are no more at rest than closed ones, and wide eyes no more than half shut ones.
-        parted, off = lips[1:].clamp_min(lips[0]), (lids[1:] - lids[1:].median()).abs()
-        calm = calm[(_ranks(parted) + _ranks(off)).argsort(stable=True)]
+    expressions = torch.cat([torch.zeros_like(face.expression[:1]), face.expression[calm]])
+    lips, lids = _openings(face, face_model, expressions)
+    # Pressed lips are no more at rest than closed ones, and wide eyes no more than half shut ones.
+    parted, off = lips[1:].clamp_min(lips[0]), (lids[1:] - lids[1:].median()).abs()
+    calm = calm[(_ranks(parted) + _ranks(off)).argsort(stable=True)]
     chosen = calm[: max(1, round(_CHOSEN / _CALM * len(calm)))]
-    middle = replace(
+    return _with_closed_lips(_median_of(face, chosen), face_model)
+
+
+def _calmest(face: FaceParams, share: float) -> Int[Tensor, " c"]:
+    """The timesteps with the smallest coefficients, the calmest first."""
+    activity = face.expression.detach().norm(dim=-1)
+    return activity.argsort(stable=True)[: max(1, round(share * len(face)))]
+
+
+def _median_of(face: FaceParams, chosen: Int[Tensor, " c"]) -> FaceParams:
+    """The median expression of some timesteps, with the median joints and head pose of all."""
+    return replace(
         face,
         expression=face.expression[chosen].median(0, keepdim=True).values,
         joints=face.joints.median(0, keepdim=True).values,
         head_rotation=face.head_rotation.median(0, keepdim=True).values,
         head_translation=face.head_translation.median(0, keepdim=True).values,
     )
-    return middle if "ibug68" not in face_model.landmarks else _with_closed_lips(middle, face_model)
 
 
 def _with_closed_lips(face: FaceParams, model: FaceModel) -> FaceParams:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from mien.avatar.avatar import neutral_of
+from mien.avatar.resting import neutral_of
 from mien.capture.capture import Capture
 from mien.capture.quality import frame_rate, is_pause
 from mien.driving.blendshape_json import read_blendshape_json

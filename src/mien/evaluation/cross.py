@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from mien.avatar.avatar import Avatar, neutral_of
+from mien.avatar.avatar import Avatar
 from mien.avatar.files import load_avatar
+from mien.avatar.resting import neutral_of
 from mien.camera import Camera
 from mien.capture.capture import Capture
 from mien.capture.person.faces import MeshReader
