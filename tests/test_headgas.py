@@ -54,10 +54,11 @@ def blended(avatar: HeadGas, face: FaceParams) -> Tensor:
     return avatar.store["neutral_features"] + torch.einsum("bk,nkf->bnf", directed(avatar, face), avatar.store["bases"])
 
 
-def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
+def test_directions_are_the_inputs_themselves_in_paper_and_else_the_largest_spread() -> None:
     face = toy_face(50)
-    rest, every = input_directions(face, neutral_of(face), 0)
-    _, two = input_directions(face, neutral_of(face), 2)
+    own, inputs = input_directions(face, neutral_of(face), 0)
+    assert (bool(own.any()), inputs.tolist()) == (False, torch.eye(5).tolist())
+    (rest, every), (_, two) = (input_directions(face, neutral_of(face), count) for count in (9, 2))
     assert torch.equal(rest, inputs_of(neutral_of(face))[0])
     # Two angles never change and the third follows an expression, so three directions are 0. The others lose nothing.
     assert torch.equal(every, torch.nn.functional.pad(two, (0, 3)))
@@ -67,9 +68,11 @@ def test_all_directions_span_the_inputs_and_few_the_largest_spread() -> None:
 
 
 def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
-    avatar, face = new_avatar(), toy_face(5)[2]
+    avatar, face = new_avatar(replace(SMALL, directions=3)), toy_face(5)[2]
+    assert not directed(avatar, avatar.subject).any()
+    avatar = new_avatar()
     fill(avatar)
-    assert torch.equal(blended(avatar, avatar.subject)[0], avatar.store["neutral_features"])
+    assert torch.equal(directed(avatar, face), inputs_of(face)), "as in the paper"
     gaussians = avatar.pose(face).gaussians
     assert torch.equal(known(gaussians.T_world_local), head_poses(face))
     first, _, last = avatar.network
@@ -199,7 +202,7 @@ def directed(avatar: HeadGas, face: FaceParams) -> Tensor:
 def test_starts_faint_gray_and_still_and_is_judged_as_it_is_drawn(variant: Variant) -> None:
     avatar, face = new_variant(variant, disturbed=False), toy_face(5)
     gaussians = avatar.pose(face).gaussians
-    assert (gaussians.opacities - 0.1).abs().max() < 0.1
+    assert (gaussians.opacities - (0.5 if variant == "no_blending" else 0.1)).abs().max() < 0.1
     assert gaussians.sh.abs().max() < 1
     torch.testing.assert_close(gaussians.means.expand(5, 40, 3), avatar.store["means"].expand(5, 40, 3))
     assert variant != "full" or torch.equal(gaussians.sh[0], gaussians.sh[3])
@@ -240,17 +243,20 @@ def test_change_all_paints_too() -> None:
     assert set(avatar.regularizers(posed, rasterize(found, toy_camera(32), torch.ones(3)), Progress(1, 2))) == {"shift"}
 
 
-def test_no_mlp_averages_colors_and_opacities() -> None:
+def test_no_mlp_averages_colors_and_opacities_by_expression_weights() -> None:
+    """Also in `standard`, whose other variants have directions."""
     avatar, face = new_variant("no_mlp"), toy_face(5)[2]
-    (e,) = directed(avatar, face)
-    average = avatar.store["neutral_features"] + torch.einsum("nko,k->no", avatar.store["bases"], e)
-    average = average / (1 + e.abs().sum())
-    found = avatar.pose(face).gaussians.timestep(0)
-    torch.testing.assert_close(found.sh[:, 0], average[:, :3])
-    torch.testing.assert_close(found.opacities, (torch.logit(torch.tensor(0.1)) + 20 * average[:, -1]).sigmoid())
+    weights = inputs_of(face)[0] / inputs_of(face).sum()
+    found, store = avatar.pose(face).gaussians.timestep(0), avatar.store
+    torch.testing.assert_close(found.sh[:, 0], torch.einsum("nko,k->no", store["bases"], weights)[:, :3])
+    torch.testing.assert_close(found.opacities, store["opacity_logits"].sigmoid() @ weights)
     assert len(list(avatar.network.parameters())) == 0
-    weights, rest = averaging_weights(torch.tensor([3.0, -4.0]))
-    torch.testing.assert_close(torch.cat([weights, rest[None]]), torch.tensor([0.375, -0.5, 0.125]))
+    assert set(store.names()) == {"means", "quats", "log_scales", "bases", "opacity_logits"}
+    for inputs, expected in (
+        ([0.5, 0, 0.25], [2 / 3, 0, 1 / 3]), ([2, -2, 1], [2, -2, 1]), ([-1, -1, 0], [0.5, 0.5, 0]),
+        ([0, 0, 0], [1 / 3] * 3), ([1, -1, 0.05], [61 / 6, -59 / 6, 4 / 6]),  # sums nearer to 0 than 0.1
+    ):  # fmt: skip
+        torch.testing.assert_close(averaging_weights(torch.tensor(inputs).float()), torch.tensor(expected).float())
 
 
 def test_no_blending_gives_the_expression_to_five_layers() -> None:
@@ -259,7 +265,8 @@ def test_no_blending_gives_the_expression_to_five_layers() -> None:
     found = avatar.pose(face).gaussians.timestep(0)
     torch.testing.assert_close(found.sh[:, 0], outputs[:, :3])
     torch.testing.assert_close(found.opacities, outputs[:, -1].sigmoid())
-    assert sum(isinstance(layer, torch.nn.Linear) for layer in avatar.network) == 5
+    assert [type(layer) for layer in avatar.network] == [torch.nn.Linear, torch.nn.LeakyReLU] * 5
+    assert (outputs < 0).any(), "the last one acts"
     assert set(avatar.store.names()) == {"means", "quats", "log_scales"}
 
 

@@ -69,7 +69,9 @@ class HeadGas(Avatar):
         unbaked = ablation and ablation.unbaked and f"the variant {config.variant} of headgas: {ablation.unbaked}"
         super().__init__(config, face_model, face, Extras(unbaked=unbaked))
         means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
-        rest, directions = input_directions(face, self.subject, config.directions)
+        # The average of `no_mlp` is one of expression weights, which directions are not.
+        count = 0 if config.variant == "no_mlp" else config.directions
+        rest, directions = input_directions(face, self.subject, count)
         self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
         spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
         # Not in files: only training needs it, and makes it anew.
@@ -165,10 +167,12 @@ class HeadGas(Avatar):
         store = self.store.arrays()
         n = len(self.store)
         neutral, along = self._baked_features()
-        layers = [layer for layer in self.network if isinstance(layer, nn.Linear)]
-        shares = self.output_shares(TRAINED).to(layers[-1].weight)
-        weights = [*(layer.weight for layer in layers[:-1]), layers[-1].weight * shares[:, None]]
-        biases = [*(layer.bias for layer in layers[:-1]), layers[-1].bias * shares]
+        weights, biases = ([getattr(layer, part) for layer in self.network[::2]] for part in ("weight", "bias"))
+        shares = self.output_shares(TRAINED).to(weights[-1])
+        if len(self.network) % 2 == 0:
+            # A record has no activation after its last layer, so the shares are a layer after the network's own.
+            weights, biases = [*weights, torch.eye(len(shares)).to(shares)], [*biases, torch.zeros_like(shares)]
+        weights[-1], biases[-1] = weights[-1] * shares[:, None], biases[-1] * shares
         network = AttributeNetwork(
             input="features",
             base=np.concatenate([as_array(neutral), as_array(self.encoding())], axis=1),
@@ -232,15 +236,17 @@ class HeadGas(Avatar):
 def input_directions(
     face: FaceParams, neutral: FaceParams, count: int
 ) -> tuple[Float[Tensor, " i"], Float[Tensor, "i k"]]:
-    """The inputs of the person at rest, and the directions along which the bases of features are weighted.
+    """The inputs where all weights are 0, and the directions along which the bases of features are weighted.
 
-    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. The
-    directions are those of the largest spread over the timesteps of `face`, at most `count` (0: as many as inputs),
-    scaled to a deviation of about 1. So one second moment serves the bases of all of them.
+    The inputs are the expression coefficients, followed by the axis-angle vectors of the free joints, in radians. With
+    a `count` of 0, they themselves are the weights, as in the paper. Otherwise weights are 0 for the person at rest,
+    and at most `count` directions are those of the largest spread over the timesteps of `face`, scaled to a deviation
+    of about 1. So one second moment serves the bases of all of them.
     """
     rest, inputs = expression_inputs(neutral)[0].detach(), expression_inputs(face)
-    directions = principal_directions(inputs - rest, min(count or len(rest), len(rest)))
-    return rest.clone(), directions
+    if count == 0:
+        return torch.zeros_like(rest), torch.eye(len(rest)).to(rest)
+    return rest.clone(), principal_directions(inputs - rest, min(count, len(rest)))
 
 
 def _stacked(parts: Sequence[Tensor]) -> Tensor:

@@ -26,7 +26,7 @@ class HeadGasConfig(MethodConfig):
     """Number of latent features per Gaussian, as in the paper."""
     directions: Annotated[int, Range(0, 1024)] = 20
     """Number of directions of the face along which features change: those of the largest spread over the training
-    timesteps. 0: as many as the face has inputs, as in the paper. Fewer need less memory and time."""
+    timesteps. 0: the inputs themselves, as in the paper and always in `no_mlp`. Fewer need less memory and time."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from mien.avatar.avatar import Posed
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
+from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.feature_network import SLOPE, Layers, blended_features
 from mien.avatar.settings import Progress
 from mien.gaussians import Gaussians
@@ -23,9 +24,9 @@ START_OPACITY = 0.1  # opacity of all Gaussians at the start. Of 3D Gaussian Spl
 SHIFT_LENGTH = 0.01  # unit of the network's shifts, in metres. The papers do not say one
 MOVED = 7
 """Numbers that move a Gaussian: a shift (3), and a rotation as a quaternion less the identity (4)."""
-_FASTER_OPACITY = 0.05 / 2.5e-3
-"""Learning rate of explicit opacities relative to that of colours, which are in the same tensor. Of 3D Gaussian
-Splatting."""
+LEAST_SUM = 0.1
+"""Sum of expression weights below which the average of `no_mlp` counts all bases. The supplement does not say one."""
+_LEAST_OPACITY = 1e-4  # of an average, whose weights may be negative
 
 
 class Changes(NamedTuple):
@@ -88,14 +89,15 @@ def start_logit() -> Float[Tensor, ""]:
     return torch.logit(torch.tensor(START_OPACITY))
 
 
-def averaging_weights(inputs: Float[Tensor, " k"]) -> tuple[Float[Tensor, " k"], Float[Tensor, ""]]:
-    """Weights of the bases and of the neutral, whose absolute values sum to 1 (`no_mlp`).
+def averaging_weights(inputs: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+    """Weights of the bases, which sum to 1: the inputs divided by their sum (`no_mlp`; supplement, section 2).
 
-    The paper averages explicit colours, weighted by the expression, because their sum gets too large. It does not say
-    what happens to negative weights or where all are 0: here they keep their sign, and the neutral has the weight 1.
+    The supplement does not say what happens at a sum of 0. Here, a sum that is nearer to 0 than `LEAST_SUM` counts as
+    that, with its sign, and all bases share alike what is left of 1: where all inputs are 0, each has the same weight.
     """
-    total = 1 + inputs.abs().sum()
-    return inputs / total, 1 / total
+    total = inputs.sum()
+    divisor = torch.where(total < 0, -1.0, 1.0) * total.abs().clamp_min(LEAST_SUM)
+    return (inputs + (divisor - total) / len(inputs)) / divisor
 
 
 def moved_by(gaussians: Gaussians, moved: Float[Tensor, "b n 7"]) -> Posed:
@@ -107,17 +109,17 @@ def moved_by(gaussians: Gaussians, moved: Float[Tensor, "b n 7"]) -> Posed:
 
 
 def _explicit(means: Tensor, directions: int, config: HeadGasConfig) -> dict[str, Tensor]:
-    return feature_tensors(means, directions, colors_of(config) + 1)
+    n, logits = len(means), start_logit().to(means).repeat(len(means), directions)
+    return {"bases": means.new_zeros(n, directions, colors_of(config)), "opacity_logits": logits}
 
 
 def _average(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Changes]:
-    shares = avatar.output_shares(progress).to(inputs)
-    shares[-1] = _FASTER_OPACITY
+    store, shares = avatar.store, avatar.output_shares(progress)[:-1].to(inputs)
+    none, opacities = inputs.new_zeros(len(store), len(shares)), sigmoid(store["opacity_logits"])
     for e in inputs:
-        weights, rest = averaging_weights(e)
-        neutral = rest * avatar.store["neutral_features"]
-        values = shares * blended_features(avatar.store["bases"], weights, None, neutral, avatar.bases_gradient)
-        yield Changes(values[:, :-1], values[:, -1] + start_logit().to(values))
+        weights = averaging_weights(e)
+        colors = shares * blended_features(store["bases"], weights, None, none, avatar.bases_gradient)
+        yield Changes(colors, torch.logit(opacities @ weights, _LEAST_OPACITY))
 
 
 def _unpainted(means: Tensor, directions: int, config: HeadGasConfig) -> dict[str, Tensor]:
@@ -159,7 +161,9 @@ def _paints_and_moves(avatar: Any, inputs: Tensor, progress: Progress) -> Iterat
 
 
 def _deep(directions: int, config: HeadGasConfig) -> nn.Sequential:
-    return new_network([directions + encoded(config), *[config.hidden] * 4, colors_of(config) + 1])
+    """Five layers, each followed by a leaky ReLU: opacities start at 1/2, because those below it change slowly."""
+    sizes = [directions + encoded(config), *[config.hidden] * 4, colors_of(config) + 1]
+    return new_network(sizes, opacity=False).append(nn.LeakyReLU(SLOPE))
 
 
 def _unblended(avatar: Any, inputs: Tensor, progress: Progress) -> Iterator[Changes]:
