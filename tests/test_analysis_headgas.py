@@ -5,6 +5,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -80,7 +81,11 @@ def test_parts_without_training_write_pictures_and_films(workspace: Path) -> Non
     assert {name: after[name] for name in before} == before
 
 
-def test_the_ablations_are_trained_alike(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_ablations_are_trained_and_timed_alike(
+    workspace: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timed, measure = [], headgas.measure_drawing
+    monkeypatch.setattr(headgas, "measure_drawing", lambda *args: timed.append(args[0].training) or measure(*args))
     asked = ("--parts", "ablations", "--steps", "6", "--seconds", "0.01")
     part = analyze(workspace, *asked)["ablations"]
     assert "ablations: 5 trainings of 6 steps each" in capsys.readouterr().err
@@ -88,32 +93,39 @@ def test_the_ablations_are_trained_alike(workspace: Path, capsys: pytest.Capture
     assert [row["name"] for row in rows] == ["no_blending", "change_all", "delta", "no_mlp", "full"]
     assert all(row["gaussians"] > 0 and row["frame_ms"] > 0 and row["head_psnr"] > 0 for row in rows)
     assert len({row["head_psnr"] for row in rows}) == 5
+    assert timed == [False] * 5, "as the avatars of finished trainings, which are baked"
     runs = sorted(path.name.rsplit("-", 2)[0] for path in (workspace / "analysis/toy/runs").iterdir() if path.is_dir())
     assert runs == [f"ablation-{name}" for name in ("change-all", "delta", "full", "no-blending", "no-mlp")]
     assert part["tables"][0]["rows"][-1][-3:] == [28_000, 4.0, 32.5]
     assert (workspace / "analysis/toy/ablations.png").is_file()
     assert analyze(workspace, *asked)["ablations"] == part
+    assert list(analyze(workspace, *asked, "--widen")["ablations"]["values"]["widths"])[:2] == ["8", "16"]
 
 
 def test_rows_differ_only_in_what_they_say() -> None:
     plain = headgas.ablation_configs(CONFIG)
     assert "no_perceptual" not in plain
-    assert (plain["full"], plain["delta"]) == (CONFIG, replace(CONFIG, variant="delta"))
+    free = replace(CONFIG, density=replace(_GROWTH, rules_off=("cap",)))
+    assert (plain["full"], plain["delta"]) == (free, replace(free, variant="delta")), "without a limit of Gaussians"
     config = replace(CONFIG, variant="no_mlp", photometric=Photometric(perceptual=PerceptualLoss(weight=0.1)))
     rows = headgas.ablation_configs(config)
     assert list(rows) == list(headgas.ABLATIONS)
     without = rows["no_perceptual"]
     assert (without.variant, without.photometric.perceptual.weight) == ("full", 0.0)
-    assert rows["full"] == replace(config, variant="full")
-    # A limit that all variants reach is no finding about their counts.
-    config = HeadGasConfig(density=GradientSettings(max_gaussians=100))
-    rows = [{"name": name, "gaussians": 100, "head_psnr": None} for name in ("delta", "full")]
-    same, limit = headgas.ablation_findings(config, 10, rows)
-    assert "All variants have 100" in same
-    assert "--method.density.max-gaussians" in limit
-    few = headgas.ablation_findings(config, 10, [rows[0] | {"gaussians": 40}, rows[1] | {"gaussians": 50}])
-    assert len(few) == 1
-    assert "with delta(mu, R) has the fewest Gaussians (40)" in few[0]
+    assert rows["full"] == replace(config, variant="full", density=free.density)
+    rows = [{"name": name, "gaussians": n, "head_psnr": None} for name, n in (("delta", 40), ("full", 50))]
+    (few,) = headgas.ablation_findings(10, rows)
+    assert "with delta(mu, R) has the fewest Gaussians (40)" in few
+
+
+def test_the_network_without_blending_widens_to_a_plateau(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores: dict[int, float | None] = {8: 20.0, 16: 20.5, 32: 20.55, 64: 30.0}
+    monkeypatch.setattr(headgas, "held_out_scores", lambda width, metric: {"head_psnr": scores[width]})
+    context: Any = SimpleNamespace(train=lambda name, config: config.hidden)
+    first: Any = 8
+    assert headgas.widened(context, CONFIG, first) == (16, {8: 20.0, 16: 20.5, 32: 20.55})
+    scores[8] = None
+    assert headgas.widened(context, CONFIG, first) == (8, {}), "nothing was held out"
 
 
 def test_gaussians_are_removed_from_near_to_far() -> None:

@@ -35,6 +35,8 @@ class Command:
     """Number of optimiser steps of each short training."""
     seconds: float = 2.0
     """Seconds to spend on each timed row."""
+    widen: bool = False
+    """Widen the ablation of HeadGaS without blending until its PSNR gains less than 0.1 dB."""
     out: Path | None = None
     """Folder for the result and the short trainings (default: analysis/RUN in the workspace)."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -45,7 +47,7 @@ class Command:
         from mien.disk.files import check_writable
         from mien.disk.reading import check_subtrees
 
-        AnalysisOptions(self.steps, self.seconds).check()
+        AnalysisOptions(self.steps, self.seconds, self.widen).check()
         workspace = self._workspace()
         chosen_parts(self._analysis(workspace), self.parts, self.train)
         check_subtrees(workspace.root, "analysis")
@@ -65,7 +67,7 @@ class Command:
         run_dir, folder = workspace.run_dir(run), self._folder(workspace, run)
         analysis = self._analysis(workspace)
         parts = chosen_parts(analysis, self.parts, self.train)
-        options = AnalysisOptions(self.steps, self.seconds)
+        options = AnalysisOptions(self.steps, self.seconds, self.widen)
         content = run_analysis(analysis, parts, run_dir, run_sequences(workspace, run_dir), folder, options)
         left = [part.name for part in analysis.parts if part.trains and part.name not in content["parts"]]
         if left:

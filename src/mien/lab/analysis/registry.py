@@ -20,6 +20,8 @@ class AnalysisOptions:
     """Number of optimiser steps of each short training."""
     seconds: Annotated[float, Range(0.01, 3600)] = 2.0
     """Seconds to spend on each timed row. A row ends after the first picture that exceeds them."""
+    widen: bool = False
+    """Whether the ablations of HeadGaS widen the network without blending until it gets no better."""
 
     def check(self) -> None:
         """Check that all numbers are in their ranges."""
