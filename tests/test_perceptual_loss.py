@@ -19,8 +19,8 @@ from mien.face import FaceModel
 from mien.gaussians import Rendering
 from mien.perceptual import weights_path
 from mien.perceptual.features import load_training_features
+from mien.training import PRESETS, train
 from mien.training import losses as photometry
-from mien.training import train
 from mien.training.footage.frames import CROP, random_at
 from mien.training.footage.sequence import Sequence, Target, Targets
 from mien.training.run import read_curves
@@ -106,6 +106,35 @@ def test_the_whole_person_counts_fully() -> None:
     assert found == [(pytest.approx(2.0 * whole(50), rel=1e-5), (50, 50, 3))] * 2
     boxes = {(10, 5, 50, 40): (10, 5, 50, 40), (0, 0, 0, 0): (0, 0, 16, 16), (78, 59, 2, 1): (64, 44, 16, 16)}
     assert {box: photometry.person_box(replace(some_target(()), box=box)) for box in boxes} == boxes
+
+
+@pytest.mark.parametrize(("length", "side"), [(100, 32), (75, 48), (90, 89), (40, 60)])
+def test_pieces_of_a_picture_have_its_mean_on_average(length: int, side: int) -> None:
+    """Each pixel has the same weight, over all places of the cuts and of the pixel that is drawn."""
+    weights, sizes = np.zeros(length), set()
+    for first, at in np.ndindex(side, length):
+        begin, end = photometry.piece_of(length, side, first, at)
+        assert begin <= at < end
+        sizes.add(end - begin)
+        weights[begin:end] += 1 / (end - begin) / side
+    np.testing.assert_allclose(weights, 1)
+    assert (min(sizes) >= 16, max(sizes) < side + 32, len(sizes) > 1) == (True, True, length > side)
+
+
+def test_a_piece_of_the_picture_counts_fully() -> None:
+    """At every resolution. It may be anywhere, also in the background."""
+    for paper in (PRESETS["paper"].config(name) for name in ("mono_gaussian_avatar", "point_avatar")):
+        assert (paper.photometric.perceptual.weight, paper.photometric.perceptual.region) == (0.1, "picture")
+    settings = PerceptualLoss(weight=2.0, region="picture", crop=32)
+    for width in (64, 128):
+        loss, (height, wide, _) = loss_of(width, settings)
+        image, dark = torch.full((height, wide, 3), 0.5), torch.full((height, wide, 3), 90 / 255)
+        assert loss == pytest.approx(2 * float(load_training_features()(image, dark)), rel=1e-5)
+    boxes = [photometry.drawn_piece(some_target(()), 24, random_at(0, CROP, step)) for step in range(500)]
+    seen = np.zeros((60, 80))
+    for left, top, wide, high in boxes:
+        seen[top : top + high, left : left + wide] += 4800 / (wide * high) / 500
+    assert 0.6 < seen.min() <= seen.max() < 1.5
 
 
 CONFIG = replace(

@@ -98,7 +98,7 @@ class PerceptualLoss:
     """
 
     weight: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Weight of the distance of features. A crop counts by its share of the picture's pixels, the whole person
+    """Weight of the distance of features. A crop of `parts` counts by its share of the picture's pixels, all else
     (`region`) fully. 0 switches the loss off."""
     start: Annotated[float, FRACTION] = 0.3
     """Time of the first step with this loss, as a fraction of the run."""
@@ -108,9 +108,10 @@ class PerceptualLoss:
     """Side of the crops, in pixels of the training pictures. The cost grows with its square."""
     blocks: Annotated[int, Range(1, 3)] = 2
     """Number of blocks of the network, from fine to coarse features. Each doubles the cost, or more."""
-    region: Literal["parts", "person"] = "parts"
+    region: Literal["parts", "person", "picture"] = "parts"
     """Part of the picture that a step compares: a crop drawn at random around the eyes, the mouth, or anywhere in the
-    scoring mask's box (parts), or all of that box (person), which takes many times as long."""
+    scoring mask's box (parts), all of that box (person), which takes many times as long, or a crop anywhere, drawn so
+    that the mean over many steps is the distance of whole pictures (picture)."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether a step of a run of `steps` has this loss."""
@@ -301,7 +302,7 @@ class FreePointsConfig(MethodConfig):
     """Number of points that these losses, and the method's others of points, use in each step, in turn."""
 
 
-FREE_POINTS_PAPER_FEATURES = {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3}
+FREE_POINTS_PAPER_FEATURES = {"weight": 0.1, "start": 0.0, "every": 1, "crop": 224, "blocks": 3, "region": "picture"}
 """The perceptual loss of the papers of these methods."""
 
 

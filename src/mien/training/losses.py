@@ -235,8 +235,12 @@ class PerceptualGoal:
 @torch.no_grad()
 def perceptual_goal(target: Target, settings: PerceptualLoss, random: torch.Generator) -> PerceptualGoal:
     """The features of the target's box, or of a crop drawn at random. They do not depend on the avatar."""
-    whole = settings.region == "person"
-    left, top, width, height = person_box(target) if whole else drawn_crop(target, settings.crop, random)
+    if settings.region == "person":
+        left, top, width, height = person_box(target)
+    elif settings.region == "picture":
+        left, top, width, height = drawn_piece(target, settings.crop, random)
+    else:
+        left, top, width, height = drawn_crop(target, settings.crop, random)
     crop = (slice(top, top + height), slice(left, left + width))
     picture = target.picture[crop].to(target.background) / 255
     return PerceptualGoal(crop, _features(picture, settings).features(picture))
@@ -245,7 +249,7 @@ def perceptual_goal(target: Target, settings: PerceptualLoss, random: torch.Gene
 def perceptual_loss(rendering: Rendering, goal: PerceptualGoal, settings: PerceptualLoss) -> Float[Tensor, ""]:
     """The weighted distance of trained features on the goal's crop. Differentiable in the rendering."""
     image = rendering.image[goal.crop]
-    share = 1.0 if settings.region == "person" else image.numel() / rendering.image.numel()
+    share = image.numel() / rendering.image.numel() if settings.region == "parts" else 1.0
     return settings.weight * share * _features(image, settings).distance(image, goal.features)
 
 
@@ -274,6 +278,30 @@ def drawn_crop(target: Target, side: int, random: torch.Generator) -> Box:
     side_x, side_y = min(side, full_width), min(side, full_height)
     x, y = int(left + across * width - side / 2), int(top + down * height - side / 2)
     return min(max(x, 0), full_width - side_x), min(max(y, 0), full_height - side_y), side_x, side_y
+
+
+def drawn_piece(target: Target, side: int, random: torch.Generator) -> Box:
+    """The piece of the picture around a pixel drawn at random, if the picture is cut at random places.
+
+    A piece is drawn as often as its share of the pixels says, so means over pieces are on average that of the picture.
+    """
+    height, width = target.picture.shape[:2]
+    x, y, column, row = torch.rand(4, generator=random, dtype=torch.float64).tolist()
+    (left, right), (top, bottom) = (
+        piece_of(length, side, int(first * side), int(at * length))
+        for length, first, at in ((width, column, x), (height, row, y))
+    )
+    return left, top, right - left, bottom - top
+
+
+def piece_of(length: int, side: int, first: int, at: int) -> tuple[int, int]:
+    """Begin and end of the piece with the pixel `at`, in a row that is cut at `first` and then every `side` pixels.
+
+    Cuts less than 16 pixels from an end do not count. A row of at most `side` pixels is whole.
+    """
+    cuts = range(first, length, side) if length > side else ()
+    cuts = [cut for cut in cuts if _LEAST_SIDE <= cut <= length - _LEAST_SIDE]
+    return max((cut for cut in cuts if cut <= at), default=0), min((cut for cut in cuts if cut > at), default=length)
 
 
 def train_psnr(rendering: Rendering, target: Target) -> float:
