@@ -13,7 +13,7 @@ from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.avatar.mono_gaussian_avatar.motion import CANONICAL_JAW, canonical_face, nearest_vertices
 from mien.avatar.mono_gaussian_avatar.networks import AttributeChangeNet, AttributeNet, Deformation, DeformationNet
 from mien.avatar.mono_gaussian_avatar.schedule import Schedule, ScheduleName
-from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, WeightNorm
 from mien.avatar.ops.points import at_places, positional_encoding, random_places
 from mien.avatar.settings import Progress, Rate
 from mien.errors import UserError
@@ -110,13 +110,14 @@ def test_vertices_with_their_own_directions_move_as_the_mesh_does_and_cost_nothi
     assert max(loss.item() for loss in losses.values()) < 1e-9
 
 
-@pytest.mark.parametrize("source", ["code", "supplement"])
-def test_losses_near_the_face_model_are_those_of_the_paper(source: str) -> None:
-    face_model, by_code = with_pose_correctives(), source == "code"
-    names = ("face_expression_weight", "face_expression_by_variance", "face_correctives_weight")
-    supplement: dict[str, Any] = dict(zip(names, (1e3, False, 1e3), strict=True))
-    paper = PRESETS["paper"].config("mono_gaussian_avatar")
-    assert supplement == {name: getattr(paper, name) for name in supplement}
+@pytest.mark.parametrize("units", ["each", "mean", "own"])
+def test_losses_near_the_face_model_are_those_of_the_paper(units: str) -> None:
+    """In units of the face model's own; those of the published code are `each`."""
+    face_model, by_code = with_pose_correctives(), units == "each"
+    names = ("face_expression_weight", "face_expression_units", "face_correctives_weight")
+    supplement: dict[str, Any] = dict(zip(names, (1e3, units, 1e3), strict=True))
+    for paper in (PRESETS["paper"].config(name) for name in ("mono_gaussian_avatar", "point_avatar")):
+        assert {name: getattr(paper, name) for name in names} == {**supplement, "face_expression_units": "own"}
     avatar = new_avatar(replace(SMALL, face_points=12, **({} if by_code else supplement)), face_model)
     progress, rows = Progress(4, 100), torch.arange(18, 30)  # points 48 .. 59, in turn, of 30
     losses = avatar.regularizers(avatar.pose(toy_face(5)[1], progress), pictured(30), progress)
@@ -132,12 +133,29 @@ def test_losses_near_the_face_model_are_those_of_the_paper(source: str) -> None:
     # Coefficients and directions in units where the mean variance of coefficients is 1.
     variance = toy_face(5).expression.var(0, correction=0)
     unit = variance.mean()
-    expression = unit.sqrt() * (found.expression - 4 * face_model.expression_basis[:, nearest].permute(1, 2, 0))
-    of_code = 10 * 10 * ((10 * expression).square() / (variance / unit * 2)).mean()
-    expected = of_code if by_code else 1000 * expression.square().mean()
-    torch.testing.assert_close(losses["expression_directions"], expected)
+    own = (found.expression - 4 * face_model.expression_basis[:, nearest].permute(1, 2, 0)).square()
+    of_code = 10 * 10 * (100 * unit * own / (variance / unit * 2)).mean()
+    expected = {"each": of_code, "mean": 1000 * unit * own.mean(), "own": 1000 * own.mean()}
+    torch.testing.assert_close(losses["expression_directions"], expected[units])
     torch.stack(list(losses.values())).sum().backward()
     assert avatar.store["means"].grad is None, "the points do not feel these losses"
+
+
+def test_joints_that_move_no_skin_are_no_bones() -> None:
+    """They are in no mean and in no softmax. FLAME has nine of them here."""
+    model, names = toy_face_model(), ("template", "identity_basis", "rotation_basis", "translation_basis")
+    fields: Any = {f"joint_{name}": getattr(model, f"joint_{name}")[..., [0, 1, 0, 2], :] for name in names}
+    weights = model.skinning_weights[:, [0, 1, 0, 2]] * torch.tensor([1.0, 1, 0, 1])
+    known: Any = {"joint_names": ("head", "neck", "idle", "jaw"), "joint_free": (False, True, False, False)}
+    idle = replace(model, **fields, **known, joint_parents=(-1, 0, 0, 0), skinning_weights=weights)
+    one, other = (new_avatar(face_model=own) for own in (model, idle))
+    face = toy_face(5)[1]
+    losses = [avatar.face_losses(avatar.store["means"])["skinning"] for avatar in (one, other)]
+    assert losses[0] == losses[1]
+    for trained in (True, False):
+        means = [avatar.train(trained).pose(face).gaussians.means for avatar in (one, other)]
+        torch.testing.assert_close(*means, atol=1e-6, rtol=0)
+    assert other.bake().rig.skinning_weights[:, 2].max() == 0
 
 
 def test_expressions_that_never_move_stay_finite() -> None:
@@ -223,10 +241,9 @@ def test_rates_halve_at_their_times() -> None:
         assert rates == [1, 1, 0.5, 0.25, 0.25], group.name
 
 
-def test_paper_has_adams_own_epsilon_and_the_published_skinning_branch() -> None:
-    """And points without attributes of their own."""
+def test_paper_has_adams_own_epsilon_and_points_without_attributes_of_their_own() -> None:
     paper: Any = PRESETS["paper"].config("mono_gaussian_avatar")
-    assert (paper.adam_epsilon, paper.skinning_norm, paper.own_rate) == (1e-8, True, Rate(0.0))
+    assert (paper.adam_epsilon, paper.weight_norm, paper.own_rate) == (1e-8, "paper", Rate(0.0))
     for epsilon, config in ((1e-8, replace(SMALL, adam_epsilon=1e-8)), (1e-15, SMALL)):
         assert {group.epsilon for group in new_avatar(config).parameter_groups()} == {epsilon}
     avatar, face = new_avatar(replace(SMALL, own_rate=Rate(0.0))), toy_face(5)[2]
@@ -302,21 +319,24 @@ def test_rounds_grow_to_the_limit_and_no_further() -> None:
     assert settings.prune_opacity == 0.1
 
 
-def test_change_network_has_the_published_layers() -> None:
+@pytest.mark.parametrize("every", [False, True])
+def test_change_network_has_the_published_layers(every: bool) -> None:
     torch.manual_seed(0)
-    network, values = AttributeChangeNet(16), torch.randn(9, 3)
+    network, values = AttributeChangeNet(16, every), torch.randn(9, 3)
     first, second, third = network.trunk
-    trunk = third(second(first(values).relu()).relu())  # no activation after the third
+    trunk = third(second(first(values).relu()).relu())
+    trunk = trunk.relu() if every else trunk  # the published code has no activation there
     heads = zip(network.heads, network.outputs, strict=True)
     expected = torch.cat([output(head(trunk).relu()) for head, output in heads], dim=-1)
     torch.testing.assert_close(network(values), expected)
 
 
-def test_attribute_network_has_the_published_layers() -> None:
+@pytest.mark.parametrize("every", [False, True])
+def test_attribute_network_has_the_published_layers(every: bool) -> None:
     torch.manual_seed(0)
-    network, points = AttributeNet(48, 7, 6), torch.randn(9, 3)
+    network, points = AttributeNet(48, 7, 6, every=every), torch.randn(9, 3)
     hidden = [softplus(head(trunk_of(network, positional_encoding(points, 6)))) for head in network.heads]
-    hidden[3] = network.color(hidden[3])
+    hidden[3] = softplus(network.color(hidden[3])) if every else network.color(hidden[3])
     expected = torch.cat([output(one) for output, one in zip(network.outputs, hidden, strict=True)], dim=-1)
     torch.testing.assert_close(network(points), expected)
     assert [AttributeNet(48, layers, 6)(points).shape for layers in (2, 3, 4, 7)] == [(9, 11)] * 4
@@ -354,20 +374,33 @@ def test_summed_directions_are_exactly_the_sums_of_directions() -> None:
     torch.testing.assert_close(found.weights, weights)
 
 
-def test_the_published_skinning_branch_has_weight_norm_and_the_start_of_the_trunk() -> None:
-    """Both branches start as nothing, with even weights."""
+def plain_layers(network: torch.nn.Module) -> set[str]:
+    """Names of the layers without weight normalisation."""
+    return {name.removesuffix(".weight").split(".")[0] for name, _ in network.named_parameters() if name.endswith(".weight")}
+
+
+def test_layers_have_the_published_weight_norm_and_start() -> None:
+    """Both branches of the deformation start as nothing, with even weights, and learn."""
     torch.manual_seed(0)
-    norm = ["bias", "parametrizations.weight.original0", "parametrizations.weight.original1"]
-    for published, names in ((False, ["bias", "weight"]), (True, norm)):
-        network = DeformationNet(400, 4, 9, 5, skinning_norm=published)
-        assert sorted(dict(network.hidden.named_parameters())) == names
+    forms: dict[WeightNorm, set[str]] = {"trunks": {"hidden"}, "code": set(), "paper": set()}
+    for form, without in forms.items():
+        network = DeformationNet(400, 4, 9, 5, form)
+        assert plain_layers(network) == without | (set() if form == "paper" else {"directions", "skinning"})
         found = network.whole(torch.randn(7, 3))
         assert found.offset.abs().max() == found.expression.abs().max() == found.pose.abs().max() == 0
         torch.testing.assert_close(found.weights, torch.full((7, 5), 0.2))
-        if published:
+        (found.expression.sum() + found.weights[:, 0].sum()).backward()
+        gradients = {name: parameter.grad for name, parameter in network.named_parameters()}
+        last = "parametrizations.weight.original0" if form == "paper" else "weight"
+        assert known(gradients[f"directions.{last}"]).any()
+        assert all(gradient is None or gradient.isfinite().all() for gradient in gradients.values())
+        if form != "trunks":
             weight, bias = network.hidden.weight, network.hidden.bias
-            assert float(weight.detach().std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)  # pyright: ignore
-            assert not bias.any()  # pyright: ignore
+            assert float(weight.detach().std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)
+            assert not bias.any()
+    paper = new_avatar(replace(SMALL, weight_norm="paper"), disturbed=False)
+    assert not plain_layers(paper.attributes) | plain_layers(paper.change) | plain_layers(paper.deformation)
+    assert plain_layers(new_avatar().attributes) == {"heads", "color", "outputs"}
 
 
 def test_nearest_vertices_take_no_distances_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:

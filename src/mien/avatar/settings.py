@@ -295,7 +295,10 @@ class FreePointsConfig(MethodConfig):
     """Weight of the mean squared distance of a point's skinning weights from those of the nearest vertex. A method
     may let this weight and the two below fall in the course of the run."""
     face_expression_weight: Annotated[float, NOT_NEGATIVE] = 1e4
-    """Weight of the same distance of expression directions, in units where the coefficients' mean variance is 1."""
+    """Weight of the same distance of expression directions."""
+    face_expression_units: Literal["own", "mean", "each"] = "mean"
+    """Units of the coefficients there: the face model's own, as in the paper, or those with a mean variance of 1 over
+    the training frames (mean), with each term also divided by its variance and their number as in the code (each)."""
     face_correctives_weight: Annotated[float, NOT_NEGATIVE] = 1e4
     """Weight of the same distance of pose correctives."""
     face_points: Annotated[int, GAUSSIAN_COUNT] = 256
@@ -322,6 +325,7 @@ def free_points_paper(epochs: int) -> dict[str, Any]:
         "max_points": 100_000,
         "epochs": epochs,
         "deformation_width": 128,
+        "face_expression_units": "own",
         "network_rate": {"start": 1e-4, "end": None},
         "face_points": 100_000,
     }

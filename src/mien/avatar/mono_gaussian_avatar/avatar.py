@@ -56,10 +56,11 @@ class MonoGaussianAvatar(FreePoints):
         )
         like = face_model.template
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
-        self.attributes = AttributeNet(*sizes, config.sphere_start).to(like)
-        self.deformation = self.new_deformation(face, skinning_norm=config.skinning_norm)
-        self.change = AttributeChangeNet(config.change_width).to(like)
-        means, self.by_variance = self.first_means(face), config.face_expression_by_variance
+        every = config.weight_norm == "paper"
+        self.attributes = AttributeNet(*sizes, config.sphere_start, every).to(like)
+        self.deformation = self.new_deformation(face, config.weight_norm)
+        self.change = AttributeChangeNet(config.change_width, every).to(like)
+        means = self.first_means(face)
         self._baked = Kept[BlendSkinned]()
         trained = {"means": means}
         if config.own_rate.start > 0:

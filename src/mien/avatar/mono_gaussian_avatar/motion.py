@@ -18,7 +18,7 @@ from mien.arrays import is_native
 from mien.avatar.avatar import Avatar
 from mien.avatar.baking import Kept, as_array, bake_rig
 from mien.avatar.mono_gaussian_avatar.networks import DeformationNet
-from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
+from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT, WeightNorm
 from mien.avatar.ops.points import at_places, random_places, sample_surface
 from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.settings import Progress
@@ -66,13 +66,14 @@ class FreePoints(Avatar, ABC):
     canonical_expression: Tensor
     canonical_joints: Tensor
     expression_variance: Tensor
-    by_variance: bool
-    """Whether a coefficient's loss is divided by its variance, relative to the mean of all, and by their number."""
+    bones: Int[Tensor, " s"]
+    """Joints that move skin. The others only place these: FLAME has five here, and nine that move nothing."""
 
-    def new_deformation(self, face: FaceParams, *, skinning_norm: bool) -> DeformationNet:
+    def new_deformation(self, face: FaceParams, form: WeightNorm) -> DeformationNet:
         """The network for faces of this kind, with random weights."""
-        outputs = (face.expression.shape[1], 9 * face.joints.shape[1], len(self.face_model.joint_names) + 1)
-        return DeformationNet(self.config.deformation_width, *outputs, skinning_norm).to(self.face_model.template)
+        self.register_buffer("bones", self.face_model.skinning_weights.any(0).nonzero()[:, 0], persistent=False)
+        outputs = (face.expression.shape[1], 9 * face.joints.shape[1], len(self.bones) + 1)
+        return DeformationNet(self.config.deformation_width, *outputs, form).to(self.face_model.template)
 
     def first_means(self, face: FaceParams) -> Float[Tensor, "n 3"]:
         """Take the canonical face from all training timesteps, and return the first points: on it, or on a sphere."""
@@ -93,9 +94,10 @@ class FreePoints(Avatar, ABC):
         return replace(self.subject, expression=self.canonical_expression[None], joints=self.canonical_joints[None])
 
     def transforms(self, face: FaceParams) -> Float[Tensor, "b k 3 4"]:
-        """The joints' transforms in the head frame, then that of the bone which stands still in the world."""
+        """The bones' transforms in the head frame, then that of the bone which stands still in the world."""
         still = _inverse(face.T_world_head) @ self.canonical_face().T_world_head
-        return torch.cat([self.face_model.joint_transforms(face), still[:, None]], dim=1)[:, :, :3]
+        moving = self.face_model.joint_transforms(face)[:, self.bones]
+        return torch.cat([moving, still[:, None]], dim=1)[:, :, :3]
 
     def at_rest(self) -> AtRest:
         """What depends on the canonical face alone."""
@@ -127,24 +129,25 @@ class FreePoints(Avatar, ABC):
     def face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
         """Weighted distances of points' skinning weights and directions from those of the nearest canonical vertex.
 
-        The squared difference of an expression direction is multiplied by the mean variance of all coefficients over
-        the training frames. The term then does not depend on how a face model scales its coefficients (the paper's
-        weights are for FLAME). Nearest vertices are found in each step, because points move.
+        By default, the squared difference of an expression direction is multiplied by the mean variance of all
+        coefficients over the training frames. The term then does not depend on how a face model scales its
+        coefficients (the paper's weights are for FLAME). Nearest vertices are found in each step, because points move.
         """
         model = self.face_model
         found = self.deformation.whole(means / LENGTH_UNIT)
         canonical = means + LENGTH_UNIT * found.offset.detach()
         nearest = nearest_vertices(canonical, self.at_rest().vertices)
         # The bone that stands still belongs to no vertex.
-        weights = torch.nn.functional.pad(model.skinning_weights[nearest], (0, 1))
+        weights = torch.nn.functional.pad(model.skinning_weights[nearest][:, self.bones], (0, 1))
         config, variance = self.config, self.expression_variance
         losses = {"skinning": config.face_skinning_weight * _mean_square(found.weights - weights)}
         difference = found.expression - model.expression_basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
         unit = variance.mean().clamp_min(1e-8)
-        if self.by_variance:
+        if config.face_expression_units == "each":
             # Coefficients that never moved would otherwise have an infinite weight.
             unit = unit / ((variance / unit).clamp_min(0.01) * len(variance))
-        losses["expression_directions"] = config.face_expression_weight * _mean_square(difference * unit.sqrt())
+        difference = difference if config.face_expression_units == "own" else difference * unit.sqrt()
+        losses["expression_directions"] = config.face_expression_weight * _mean_square(difference)
         if found.pose.shape[-1] > 0:
             basis = model.pose_basis
             correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
@@ -166,12 +169,14 @@ class FreePoints(Avatar, ABC):
         canonical = means + LENGTH_UNIT * found.offset
         skinning = blend_transforms(found.weights, self.transforms(face))[0]
         coefficients = self.coefficients(face, absolute=True)
+        weights = found.weights.new_zeros(len(means), len(rig.joint_parents))
+        weights[:, self.bones] = found.weights[:, :-1]
         rest = unskin(canonical, skinning) - torch.cat([expression, pose], dim=-1) @ coefficients[0]
         moved = replace(
             rig,
             template=as_array(rest),
             expression_basis=as_array(expression.permute(2, 0, 1)),
-            skinning_weights=as_array(found.weights[:, :-1]),
+            skinning_weights=as_array(weights),
             pose_basis=as_array(pose.permute(2, 0, 1)),
         )
         still = (as_array(found.weights[:, -1]), as_array(face.T_world_head[0]))

@@ -1,9 +1,9 @@
 """The three networks of MonoGaussianAvatar: attributes at rest, deformation of points, change of attributes.
 
-Their inputs and outputs that are lengths are in units of
-`LENGTH_UNIT`. Each is a list of `Layer`, made anew from its
+Their inputs and outputs that are lengths are in units of `LENGTH_UNIT`. Each is a list of `Layer`, made anew from its
 parameters for every step: linear layers that follow each other are multiplied first, which changes nothing but the
-speed.
+speed. Trunks have weight normalisation. With `every`, all layers have, and all but the last are followed by an
+activation, as in figures 14 and 15 of the supplement.
 """
 
 import math
@@ -12,8 +12,10 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torch.nn.utils.parametrizations import weight_norm
 
+from mien.avatar.mono_gaussian_avatar.settings import WeightNorm
 from mien.avatar.ops.point_network import Activation, Layer, point_network
 from mien.avatar.ops.points import positional_encoding
 
@@ -32,13 +34,12 @@ ATTRIBUTE_WIDTHS = (3, 4, 1, 3)
 class AttributeNet(nn.Module):
     """Raw attributes of a point at rest, given its position.
 
-    The trunk has weight normalisation, the heads have none. With `sphere`, the trunk starts as about the signed
-    distance to a sphere, as published.
+    With `sphere`, the trunk starts as about the signed distance to a sphere, as published.
     """
 
-    def __init__(self, width: int, layers: int, bands: int, sphere: bool = True):
+    def __init__(self, width: int, layers: int, bands: int, sphere: bool = True, every: bool = False):
         super().__init__()
-        self.bands = bands
+        self.bands, self.every = bands, every
         inputs = 3 + 6 * bands
         # The encoding enters a second time after the third layer, which has fewer outputs to make room for it.
         self.skip = _SKIP if layers > _SKIP and width > inputs else None
@@ -55,14 +56,14 @@ class AttributeNet(nn.Module):
                 nn.init.constant_(plain[-1].bias, -_SPHERE_RADIUS)
         # Last, so that the norms are those of the weights above.
         self.trunk = nn.ModuleList(weight_norm(layer) for layer in plain)
-        self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
-        self.color = nn.Linear(width, width)
-        self.outputs = nn.ModuleList(nn.Linear(width, size) for size in ATTRIBUTE_WIDTHS)
+        self.heads = nn.ModuleList(_normed(nn.Linear(width, width), every) for _ in ATTRIBUTE_WIDTHS)
+        self.color = _normed(nn.Linear(width, width), every)
+        self.outputs = nn.ModuleList(_normed(nn.Linear(width, size), every) for size in ATTRIBUTE_WIDTHS)
         with torch.no_grad():
             _as_linear(self.outputs[1]).bias.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
 
     def layers(self) -> list[Layer]:
-        """The layers that follow the encoding. The colour's second layer is linear, and joins the one after it."""
+        """The layers that follow the encoding. Where the colour's second layer is linear, it joins the one after it."""
         layers = []
         for index, layer in enumerate(self.trunk):
             weight, bias = _as_linear(layer).weight, _as_linear(layer).bias
@@ -70,10 +71,16 @@ class AttributeNet(nn.Module):
                 layers.append(Layer(weight / math.sqrt(2), bias, "softplus", extra=0))
             else:
                 layers.append(Layer(weight, bias, "softplus"))
-        hidden = [_as_linear(head) for head in self.heads]
+        layers.append(_beside([_as_linear(head) for head in self.heads], "softplus"))
         *others, last = [(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs]
-        joined = (last[0] @ self.color.weight, last[0] @ self.color.bias + last[1])
-        return [*layers, _beside(hidden, "softplus"), _block_diagonal([*others, joined])]
+        weight, bias = self.color.weight, self.color.bias
+        if not self.every:
+            return [*layers, _block_diagonal([*others, (last[0] @ weight, last[0] @ bias + last[1])])]
+        # The second layer reads the colour's head, the last one reads this layer for the colour, and the other heads.
+        own, rows = _block_diagonal(others), sum(ATTRIBUTE_WIDTHS[:-1])
+        read = [pad(last[0], (0, 0, rows, 0)), pad(own.weight, (0, len(bias), 0, len(last[1])))]
+        second = Layer(pad(weight, (len(others) * len(bias), 0)), bias, "softplus")
+        return [*layers, second, Layer(torch.cat(read, dim=1), torch.cat([own.bias, last[1]]), extra=len(layers))]
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 11"]:
         """Columns as in `ATTRIBUTES`."""
@@ -94,18 +101,20 @@ class Deformation(NamedTuple):
 class DeformationNet(nn.Module):
     """Offset, blend directions and skinning weights of a point, given its position. At first zero, zero, equal.
 
-    With `skinning_norm`, the hidden layer of the skinning weights has weight normalisation, as published.
+    In the form `code`, the hidden layer of the skinning weights also has weight normalisation, in `paper` all layers.
     """
 
-    def __init__(self, width: int, expressions: int, pose_features: int, bones: int, skinning_norm: bool = False):
+    def __init__(self, width: int, expressions: int, pose_features: int, bones: int, form: WeightNorm = "trunks"):
         super().__init__()
         self.expressions, self.pose_features = expressions, pose_features
         self.trunk = nn.ModuleList(weight_norm(_linear(size, width)) for size in (3, width, width, width))
         self.directions = nn.Linear(width, 3 * (1 + expressions + pose_features))
-        self.hidden = weight_norm(_linear(width, width)) if skinning_norm else nn.Linear(width, width)
+        self.hidden = nn.Linear(width, width) if form == "trunks" else weight_norm(_linear(width, width))
         self.skinning = nn.Linear(width, bones)
         for last in (self.directions, self.skinning):
-            nn.init.zeros_(last.weight)
+            # A weight of 0 has no direction, so only its length is 0 at first.
+            length = "parametrizations.weight.original0" if form == "paper" else "weight"
+            nn.init.zeros_(_normed(last, form == "paper").get_parameter(length))
             nn.init.zeros_(last.bias)
 
     def forward(
@@ -147,31 +156,32 @@ class DeformationNet(nn.Module):
 
 
 class AttributeChangeNet(nn.Module):
-    """Changes of a point's raw attributes, given its motion from the canonical position."""
+    """Changes of a point's raw attributes, given its motion from the canonical position.
 
-    def __init__(self, width: int):
+    Without `every`, there is no activation after the third layer, as in the published code: this layer and the next
+    form one linear map.
+    """
+
+    def __init__(self, width: int, every: bool = False):
         super().__init__()
-        # There is no activation after the third layer, as in the published code: this layer and the next form one
-        # linear map.
+        self.every = every
         self.trunk = nn.ModuleList(weight_norm(nn.Linear(size, width)) for size in (3, width, width))
-        self.heads = nn.ModuleList(nn.Linear(width, width) for _ in ATTRIBUTE_WIDTHS)
-        self.outputs = nn.ModuleList(nn.Linear(width, size) for size in ATTRIBUTE_WIDTHS)
+        self.heads = nn.ModuleList(_normed(nn.Linear(width, width), every) for _ in ATTRIBUTE_WIDTHS)
+        self.outputs = nn.ModuleList(_normed(nn.Linear(width, size), every) for size in ATTRIBUTE_WIDTHS)
 
     def forward(self, displacement: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 11"]:
         """Columns as in `ATTRIBUTES`."""
         return point_network(displacement.flatten(0, -2), self.layers()).unflatten(0, displacement.shape[:-1])
 
     def layers(self) -> list[Layer]:
-        """An equivalent plain network with ReLU between all of its four layers."""
-        first, second, third = (_as_linear(layer) for layer in self.trunk)
+        """An equivalent plain network with ReLU between all of its layers."""
+        *trunk, third = (Layer(_as_linear(layer).weight, _as_linear(layer).bias, "relu") for layer in self.trunk)
         fan_out = _beside([_as_linear(head) for head in self.heads], "relu")
-        third_weight = third.weight
-        return [
-            Layer(first.weight, first.bias, "relu"),
-            Layer(second.weight, second.bias, "relu"),
-            Layer(fan_out.weight @ third_weight, fan_out.weight @ third.bias + fan_out.bias, "relu"),
-            _block_diagonal([(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs]),
-        ]
+        last = _block_diagonal([(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs])
+        if self.every:
+            return [*trunk, third, fan_out, last]
+        joined = Layer(fan_out.weight @ third.weight, fan_out.weight @ third.bias + fan_out.bias, "relu")
+        return [*trunk, joined, last]
 
 
 def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:
@@ -181,6 +191,11 @@ def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:
 def _block_diagonal(layers: list[tuple[Tensor, Tensor]]) -> Layer:
     """Layers, each of which reads its own columns, as one."""
     return Layer(torch.block_diag(*(weight for weight, _ in layers)), torch.cat([bias for _, bias in layers]))
+
+
+def _normed(layer: nn.Linear, wanted: bool) -> nn.Linear:
+    """The layer, with weight normalisation if it is wanted. Its weights stay the same."""
+    return _as_linear(weight_norm(layer)) if wanted else layer
 
 
 def _as_linear(layer: nn.Module) -> nn.Linear:

@@ -17,6 +17,8 @@ from mien.disk.config import NotBelow, Range
 LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 _WIDTH = Range(1, 1024)
+WeightNorm = Literal["trunks", "code", "paper"]
+"""Which layers of the networks have weight normalisation."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,9 @@ class MonoGaussianAvatarConfig(FreePointsConfig):
     """Number of octaves of its encoding of positions. The shortest wave is 6 mm; with 6 octaves, 49 mm."""
     sphere_start: bool = False
     """Whether its trunk starts as about the signed distance to a sphere, as in the paper."""
-    skinning_norm: bool = False
-    """Whether the hidden layer of the skinning weights has weight normalisation, as published."""
+    weight_norm: WeightNorm = "trunks"
+    """Layers with weight normalisation: those of the trunks, also the hidden one of the skinning weights as in the
+    published code (code), or all, each but the last followed by an activation, as in the paper's figures (paper)."""
     change_width: Annotated[int, _WIDTH] = 32
     """Width of the network that changes attributes with motion."""
     scale_gain: Annotated[float, Range(0, 1000)] = 0.00625
@@ -61,9 +64,7 @@ class MonoGaussianAvatarConfig(FreePointsConfig):
     """Adam's epsilon for points and networks. Only 1e-15 is in the native code (published code: 1e-8)."""
     rate_halvings: Annotated[tuple[float, ...], Range(0, 1, ascending=True)] = ()
     """Times at which their rates are halved, as fractions of the run (paper: epochs 80 and 100)."""
-    face_expression_by_variance: bool = True
-    """Whether a coefficient's term is also divided by its variance and by the number of coefficients, as in the
-    published code; the supplement has neither."""
+    face_expression_units: Literal["own", "mean", "each"] = "each"
 
 
 _PAPER_EPOCHS, _PAPER_FRAMES = 120, 2_500
@@ -79,14 +80,13 @@ _PAPER = {
     "attribute_layers": 7,
     "encoding_bands": 6,
     "sphere_start": True,
-    "skinning_norm": True,
+    "weight_norm": "paper",
     "change_width": 64,
     "means_rate": {"start": 1e-4 * LENGTH_UNIT, "end": None},
     "own_rate": {"start": 0.0, "end": None},
     "adam_epsilon": 1e-8,
     "rate_halvings": [80 / _PAPER_EPOCHS, 100 / _PAPER_EPOCHS],
     "face_expression_weight": 1e3,
-    "face_expression_by_variance": False,
     "face_correctives_weight": 1e3,
 }
 """The paper's settings (docs/paper_preset.md)."""

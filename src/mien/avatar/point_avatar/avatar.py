@@ -69,9 +69,8 @@ class PointAvatar(FreePoints):
         )
         like = face_model.template
         self.surface_net = SurfaceNet(config.surface_width, config.surface_layers, config.encoding_bands).to(like)
-        self.deformation = self.new_deformation(face, skinning_norm=True)
+        self.deformation = self.new_deformation(face, "code")
         self.shading = ShadingNet(config.shading_width).to(like)
-        self.by_variance = False
         self.store = GaussianStore({"means": self.first_means(face)})
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
