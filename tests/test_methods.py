@@ -53,7 +53,7 @@ CONFIGS["gaussian_avatars-perceptual"] = plain_gaussian_avatars(
 )
 CONFIGS["mono_gaussian_avatar-batch"] = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4,
-    points_per_step=240,
+    points_per_step=240, weight_norm="paper",
 )  # fmt: skip
 UNBAKED = ("headgas-no_mlp", "headgas-delta", "headgas-change_all")
 baked = pytest.mark.parametrize("method", [name for name in CONFIGS if name not in UNBAKED])
