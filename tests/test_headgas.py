@@ -16,7 +16,7 @@ from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
 from mien.avatar.ops.points import positional_encoding
 from mien.avatar.resting import neutral_of
-from mien.avatar.settings import PerceptualLoss, Photometric, Progress
+from mien.avatar.settings import Progress
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams
 from mien.face.posing import head_poses
@@ -25,7 +25,6 @@ from mien.rotation import matrix_from_quaternion
 from mien.runtime import pose
 from mien.training import PRESETS
 from mien.training.adam import Adam
-from mien.training.density_control.gradient import round_steps
 from test_feature_network import product
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
 
@@ -84,9 +83,7 @@ def test_color_and_opacity_are_the_networks_of_features_and_place() -> None:
     torch.testing.assert_close(gaussians.opacities[0], values[:, 12].sigmoid())
 
 
-def test_paper_trains_bases_by_adam_and_centres_through_their_encoding() -> None:
-    paper: Any = PRESETS["paper"].config("headgas")
-    assert (paper.encoding_gradient, paper.factored_bases, paper.network_epsilon) == (True, False, 1e-8)
+def test_bases_may_be_trained_by_adam_and_centres_through_their_encoding() -> None:
     groups = {group.name: group for group in new_avatar(replace(SMALL, network_epsilon=1e-8)).parameter_groups()}
     assert (groups["network"].epsilon, groups["means"].epsilon) == (1e-8, 1e-15)
     moved, by_bases = [], []
@@ -137,17 +134,6 @@ def test_higher_degrees_learn_slower_and_begin_later() -> None:
     share = torch.where(torch.arange(16)[:, None] < 1, 1, 0.05)
     torch.testing.assert_close(full, share * plain.pose(face).gaussians.sh[0])
     torch.testing.assert_close(torch.from_numpy(pose(avatar.bake(), runtime_face(face)).sh), full)
-
-
-def test_the_papers_schedule() -> None:
-    config: Any = PRESETS["paper"].config("headgas")
-    steps = PRESETS["paper"].settings_of("headgas").steps
-    density = config.density
-    rounds = sorted(round_steps(density.start, density.stop, density.rounds, steps))
-    assert (steps, rounds) == (50_000, list(range(600, 15_000, 100)))
-    assert (config.points, config.features, config.hidden, config.sh_degree, config.directions) == (2500, 32, 64, 3, 0)
-    perceptual = PerceptualLoss(weight=0.1, start=0.2, every=1, blocks=3, region="person")
-    assert config.photometric == Photometric(0.8, 0.2, perceptual=perceptual)
 
 
 def test_points_are_on_the_mesh_evenly_by_area_and_know_their_neighbors() -> None:

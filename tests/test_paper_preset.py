@@ -202,12 +202,6 @@ def test_mono_gaussian_avatar_has_the_papers_sizes_rates_and_schedules() -> None
     check_section("MonoGaussianAvatar")
 
 
-def test_epochs_and_units_of_mono_gaussian_avatar() -> None:
-    known = figures("mono_gaussian_avatar")
-    assert (known["epochs"], known["frames"], known["paper_lengths"]) == (120, 2_500, 4)
-    assert (known["points_for_all_frames"], known["halvings"]) == (12_800, [80, 100])
-
-
 def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_points() -> None:
     method, small, paper = "mono_gaussian_avatar", PRESETS["paper-cpu"], PRESETS["paper"]
     config: Any = small.config(method)

@@ -130,11 +130,8 @@ def test_a_piece_of_the_picture_counts_fully() -> None:
         loss, (height, wide, _) = loss_of(width, settings)
         image, dark = torch.full((height, wide, 3), 0.5), torch.full((height, wide, 3), 90 / 255)
         assert loss == pytest.approx(2 * float(load_training_features()(image, dark)), rel=1e-5)
-    boxes = [photometry.drawn_piece(some_target(()), 24, random_at(0, CROP, step)) for step in range(500)]
-    seen = np.zeros((60, 80))
-    for left, top, wide, high in boxes:
-        seen[top : top + high, left : left + wide] += 4800 / (wide * high) / 500
-    assert 0.6 < seen.min() <= seen.max() < 1.5
+    boxes = np.array([photometry.drawn_piece(some_target(()), 24, random_at(0, CROP, step)) for step in range(50)])
+    assert (boxes[:, :2].min(), (boxes[:, :2] + boxes[:, 2:]).max(0).tolist()) == (0, [80, 60])
 
 
 CONFIG = replace(

@@ -1,13 +1,14 @@
 """PointAvatar follows its formulas: the schedule, light by normals, prunes of hidden points, and closed holes."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from mien.avatar.mono_gaussian_avatar import motion
+from mien.avatar.mono_gaussian_avatar.motion import nearest_vertices
 from mien.avatar.mono_gaussian_avatar.settings import LENGTH_UNIT
 from mien.avatar.point_avatar.avatar import PointAvatar, was_drawn
 from mien.avatar.point_avatar.networks import SurfaceNet
@@ -18,7 +19,6 @@ from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
 from mien.render import rasterize
 from mien.render.rasterize import close_holes
-from mien.training import PRESETS
 from plain_settings import plain_point_avatar
 from refusals import refuses
 from toy_scene import rgb_from_sh, toy_camera, toy_face, toy_face_model
@@ -57,8 +57,6 @@ def test_points_double_and_shrink_together() -> None:
     assert len(targets) == 19
     # The round that ends epoch 3 already fills up to the number of epoch 4.
     assert (targets[3 / 20], targets[4 / 20], targets[19 / 20]) == (30, 60, 100)
-    paper: Any = PRESETS["paper"].config("point_avatar")
-    assert (paper.start, paper.points, paper.max_points, paper.normals) == ("sphere", 400, 100_000, "deformed")
     # In the paper's lengths, of a head of four times life size: 400 points of radius 0.15 * 0.75^2.
     avatar = new_avatar(replace(SMALL, points=400, max_points=100_000), disturbed=False)
     assert 4 * avatar.radius(0.0) == pytest.approx(0.15 * 0.75**2)
@@ -130,3 +128,19 @@ def test_closing_fills_bright_specks_and_keeps_the_rest() -> None:
     assert torch.equal(close_holes(picture, 1), whole)
     assert torch.equal(close_holes(picture, 0), picture)
     assert new_avatar().extras.closing == 1
+
+
+def test_nearest_vertices_take_no_distances_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU there is a tree. Points are looked at in parts where there is none, as on a GPU."""
+    random, sizes, addmm = torch.Generator().manual_seed(0), [], torch.addmm
+    points, vertices = (torch.randn(n, 3, generator=random, dtype=torch.float64) for n in (1000, 50))
+    monkeypatch.setattr(motion, "POINTS_AT_ONCE", 64)
+    monkeypatch.setattr(torch, "addmm", lambda *args, **more: sizes.append(len(args[1])) or addmm(*args, **more))
+    expected = (points[:, None] - vertices).norm(dim=-1).argmin(1)
+    assert torch.equal(nearest_vertices(points, vertices), expected)
+    assert max(sizes) == 64
+    monkeypatch.delattr(torch, "addmm")
+    points, vertices = points.float(), vertices.float()
+    assert torch.equal(nearest_vertices(points, vertices), expected)
+    points[0, 0] = float("nan")
+    assert torch.equal(nearest_vertices(points, vertices)[1:], expected[1:])

@@ -101,15 +101,9 @@ class _PhotometricLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        image: Tensor,
-        target: Tensor,
-        box: Box,
-        drawn: Tensor | None,
-        weights: tuple[float, float],
-        parts: Sequence[Box],
-        part_weight: float,
-    ) -> Tensor:
+        ctx: Any, image: Tensor, target: Tensor, box: Box, drawn: Tensor | None, weights: tuple[float, float],
+        parts: Sequence[Box], part_weight: float,
+    ) -> Tensor:  # fmt: skip
         gradient = recycled(*image.shape) if ctx.needs_input_grad[0] else None
         drawn = None if drawn is None else drawn.detach().contiguous()
         loss = torch.empty(())
@@ -128,13 +122,9 @@ class _PhotometricLoss(torch.autograd.Function):
 
 
 def _add_part(
-    part: Box,
-    image: Float[Tensor, "h w 3"],
-    target: Tensor,
-    weights: tuple[float, float],
-    part_weight: float,
+    part: Box, image: Float[Tensor, "h w 3"], target: Tensor, weights: tuple[float, float], part_weight: float,
     gradient: Float[Tensor, "h w 3"] | None,
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """The weighted loss of the pictures cut to a box. Its gradient is added to that of the whole picture."""
     _, _, width, height = part
     loss = torch.zeros(())
@@ -235,13 +225,8 @@ class PerceptualGoal:
 @torch.no_grad()
 def perceptual_goal(target: Target, settings: PerceptualLoss, random: torch.Generator) -> PerceptualGoal:
     """The features of the target's box, or of a crop drawn at random. They do not depend on the avatar."""
-    if settings.region == "person":
-        left, top, width, height = person_box(target)
-    elif settings.region == "picture":
-        left, top, width, height = drawn_piece(target, settings.crop, random)
-    else:
-        left, top, width, height = drawn_crop(target, settings.crop, random)
-    crop = (slice(top, top + height), slice(left, left + width))
+    draw = drawn_piece if settings.region == "picture" else drawn_crop
+    crop = _slices(person_box(target) if settings.region == "person" else draw(target, settings.crop, random))
     picture = target.picture[crop].to(target.background) / 255
     return PerceptualGoal(crop, _features(picture, settings).features(picture))
 
@@ -281,16 +266,13 @@ def drawn_crop(target: Target, side: int, random: torch.Generator) -> Box:
 
 
 def drawn_piece(target: Target, side: int, random: torch.Generator) -> Box:
-    """The piece of the picture around a pixel drawn at random, if the picture is cut at random places.
+    """The piece around a random pixel of the picture, which is cut at random places.
 
-    A piece is drawn as often as its share of the pixels says, so means over pieces are on average that of the picture.
+    A piece is drawn as often as its share of the pixels says: on average, means over pieces are that of the picture.
     """
-    height, width = target.picture.shape[:2]
-    x, y, column, row = torch.rand(4, generator=random, dtype=torch.float64).tolist()
-    (left, right), (top, bottom) = (
-        piece_of(length, side, int(first * side), int(at * length))
-        for length, first, at in ((width, column, x), (height, row, y))
-    )
+    (height, width, _), at = target.picture.shape, torch.rand(4, generator=random, dtype=torch.float64).tolist()
+    left, right = piece_of(width, side, int(at[0] * side), int(at[1] * width))
+    top, bottom = piece_of(height, side, int(at[2] * side), int(at[3] * height))
     return left, top, right - left, bottom - top
 
 
@@ -299,8 +281,7 @@ def piece_of(length: int, side: int, first: int, at: int) -> tuple[int, int]:
 
     Cuts less than 16 pixels from an end do not count. A row of at most `side` pixels is whole.
     """
-    cuts = range(first, length, side) if length > side else ()
-    cuts = [cut for cut in cuts if _LEAST_SIDE <= cut <= length - _LEAST_SIDE]
+    cuts = [cut for cut in range(first, length, side) if _LEAST_SIDE <= cut <= length - _LEAST_SIDE and side < length]
     return max((cut for cut in cuts if cut <= at), default=0), min((cut for cut in cuts if cut > at), default=length)
 
 

@@ -132,9 +132,8 @@ class HeadGas(Avatar):
             "sh": config.features_rate,
             "opacity_logits": _OPACITY_RATE,
         }
-        extent = {"means": config.means_times_extent}
         groups = [
-            store_group(self.store, name, rates[name], times_extent=extent.get(name, False))
+            store_group(self.store, name, rates[name], times_extent=name == "means" and config.means_times_extent)
             for name in self.store.names()
             if name in rates
         ]

@@ -51,9 +51,8 @@ class MonoGaussianAvatar(FreePoints):
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
         pretraining = Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None
-        super().__init__(
-            config, face_model, face, Extras(frames_per_step=self._frames_per_step, pretraining=pretraining)
-        )
+        extras = Extras(frames_per_step=self._frames_per_step, pretraining=pretraining)
+        super().__init__(config, face_model, face, extras)
         like = face_model.template
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
         every = config.weight_norm == "paper"
@@ -136,9 +135,7 @@ class MonoGaussianAvatar(FreePoints):
         network = AttributeNetwork(
             input="displacement",
             base=as_array(motion.to_rest),
-            weights=tuple(
-                as_array(part) for part in (torch.cat([first, first], dim=1), *(layer.weight for layer in layers[1:]))
-            ),
+            weights=tuple(map(as_array, (torch.cat([first, first], dim=1), *(layer.weight for layer in layers[1:])))),
             biases=tuple(as_array(layer.bias) for layer in layers),
             activation="relu",
             outputs=ATTRIBUTES,

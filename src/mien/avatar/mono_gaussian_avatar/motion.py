@@ -129,9 +129,8 @@ class FreePoints(Avatar, ABC):
     def face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
         """Weighted distances of points' skinning weights and directions from those of the nearest canonical vertex.
 
-        By default, the squared difference of an expression direction is multiplied by the mean variance of all
-        coefficients over the training frames. The term then does not depend on how a face model scales its
-        coefficients (the paper's weights are for FLAME). Nearest vertices are found in each step, because points move.
+        With units of a mean variance of 1, the term of expressions does not depend on how a face model scales its
+        coefficients (the paper's weight is for FLAME). Nearest vertices are found in each step, because points move.
         """
         model = self.face_model
         found = self.deformation.whole(means / LENGTH_UNIT)
@@ -168,7 +167,7 @@ class FreePoints(Avatar, ABC):
         face = self.canonical_face()
         canonical = means + LENGTH_UNIT * found.offset
         skinning = blend_transforms(found.weights, self.transforms(face))[0]
-        coefficients = self.coefficients(face, absolute=True)
+        coefficients, still = self.coefficients(face, absolute=True), found.weights[:, -1]
         weights = found.weights.new_zeros(len(means), len(rig.joint_parents))
         weights[:, self.bones] = found.weights[:, :-1]
         rest = unskin(canonical, skinning) - torch.cat([expression, pose], dim=-1) @ coefficients[0]
@@ -179,18 +178,15 @@ class FreePoints(Avatar, ABC):
             skinning_weights=as_array(weights),
             pose_basis=as_array(pose.permute(2, 0, 1)),
         )
-        still = (as_array(found.weights[:, -1]), as_array(face.T_world_head[0]))
-        return BakedMotion(moved, rest - canonical, *still)
+        return BakedMotion(moved, rest - canonical, as_array(still), as_array(face.T_world_head[0]))
 
     def pretrain(self, face: FaceParams) -> Iterator[None]:
         """Teach the network the face model's motion in training frames, before the first picture.
 
         The published network starts without any motion, and needs some hundred thousand steps to find it.
         """
-        steps, optimizer = (
-            self.config.pretraining,
-            torch.optim.Adam(self.deformation.parameters(), lr=_PRETRAINING_RATE),
-        )
+        steps = self.config.pretraining
+        optimizer = torch.optim.Adam(self.deformation.parameters(), lr=_PRETRAINING_RATE)
         canonical, faces = self.at_rest().vertices, self.face_model.faces
         for step in range(steps):
             optimizer.param_groups[0]["lr"] = _PRETRAINING_RATE * 0.1 ** (step / steps)

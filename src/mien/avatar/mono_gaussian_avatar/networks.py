@@ -156,11 +156,7 @@ class DeformationNet(nn.Module):
 
 
 class AttributeChangeNet(nn.Module):
-    """Changes of a point's raw attributes, given its motion from the canonical position.
-
-    Without `every`, there is no activation after the third layer, as in the published code: this layer and the next
-    form one linear map.
-    """
+    """Changes of a point's raw attributes, given its motion from the canonical position."""
 
     def __init__(self, width: int, every: bool = False):
         super().__init__()
@@ -180,6 +176,7 @@ class AttributeChangeNet(nn.Module):
         last = _block_diagonal([(_as_linear(output).weight, _as_linear(output).bias) for output in self.outputs])
         if self.every:
             return [*trunk, third, fan_out, last]
+        # There is no activation after the third layer, as in the published code: it and the next are one linear map.
         joined = Layer(fan_out.weight @ third.weight, fan_out.weight @ third.bias + fan_out.bias, "relu")
         return [*trunk, joined, last]
 

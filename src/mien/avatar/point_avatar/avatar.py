@@ -56,17 +56,13 @@ class PointAvatar(FreePoints):
     config: PointAvatarConfig
 
     def __init__(self, config: PointAvatarConfig, face_model: FaceModel, face: FaceParams):
-        super().__init__(
-            config,
-            face_model,
-            face,
-            Extras(
-                frames_per_step=lambda: config.frames_per_step,
-                pretraining=Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None,
-                unbaked=_UNBAKED if config.normals == "deformed" else None,
-                closing=config.closing,
-            ),
+        extras = Extras(
+            frames_per_step=lambda: config.frames_per_step,
+            pretraining=Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None,
+            unbaked=_UNBAKED if config.normals == "deformed" else None,
+            closing=config.closing,
         )
+        super().__init__(config, face_model, face, extras)
         like = face_model.template
         self.surface_net = SurfaceNet(config.surface_width, config.surface_layers, config.encoding_bands).to(like)
         self.deformation = self.new_deformation(face, "code")

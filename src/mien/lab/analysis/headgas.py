@@ -252,6 +252,7 @@ def beyond(context: Context) -> Result:
     factors, changes = _changes(context, index, most)
     inside, outside = (float(changes[part].mean()) for part in (factors <= 1.001, factors > 1.001))
     low, high = (math.degrees(yaw) for yaw in trained.yaws)
+    title, series = f"Change of the picture by a tenth more of {name}", [Series("this run", factors, changes)]
     axes = Axes("times the largest training value", "mean change, of 255", from_zero=True, shaded=((1.0, _REACH),))
     return Result(
         {
@@ -269,15 +270,7 @@ def beyond(context: Context) -> Result:
             f"Training saw the head from {low:.0f} to {high:.0f} degrees (yaw, positive to the subject's left). "
             "Pictures go 30 degrees farther on both sides.",
         ],
-        charts=[
-            Chart(
-                "beyond-change",
-                f"Change of the picture by a tenth more of {name}",
-                [Series("this run", factors, changes)],
-                axes,
-                "Shaded: what training did not see.",
-            )
-        ],
+        charts=[Chart("beyond-change", title, series, axes, "Shaded: what training did not see.")],
         pictures=[
             Picture("beyond-expression", picture_grid(grid, len(shown)), f"{name}, and the mesh below."),
             Picture("beyond-view", side_by_side(views), "The person at rest; the outer two on each side are unseen."),

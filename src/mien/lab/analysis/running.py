@@ -183,8 +183,7 @@ def run_analysis(
         context = Context(run_dir, tuple(sequence_dirs), folder, options)
         for part in parts:
             timed = [options.seconds, _native.thread_count()] if part.timed else None
-            trained = [options.steps, options.widen] if part.trains else None
-            key = _digest_of([part.name, avatar, trained, timed])
+            key = _digest_of([part.name, avatar, [options.steps, options.widen] if part.trains else None, timed])
             if content["parts"].get(part.name, {}).get("key") == key:
                 say(f"{part.name}: measured before")
             else:
