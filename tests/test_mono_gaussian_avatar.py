@@ -382,7 +382,8 @@ def test_layers_have_the_published_weight_norm_and_start() -> None:
         assert known(gradients[f"directions.{last}"]).any()
         assert all(gradient is None or gradient.isfinite().all() for gradient in gradients.values())
         if form != "trunks":
-            assert float(network.hidden.weight.detach().std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)
+            first = network.hidden.get_parameter("parametrizations.weight.original1").detach()
+            assert float(first.std()) == pytest.approx((2 / 400) ** 0.5, rel=0.02)
     paper = new_avatar(replace(SMALL, weight_norm="paper"), disturbed=False)
     assert not plain_layers(paper.attributes) | plain_layers(paper.change) | plain_layers(paper.deformation)
     assert plain_layers(new_avatar().attributes) == {"heads", "color", "outputs"}

@@ -70,8 +70,7 @@ class HeadGas(Avatar):
         super().__init__(config, face_model, face, Extras(unbaked=unbaked))
         means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
         # The average of `no_mlp` is one of expression weights, which directions are not.
-        count = 0 if config.variant == "no_mlp" else config.directions
-        rest, directions = input_directions(face, self.subject, count)
+        rest, directions = input_directions(face, self.subject, 0 if config.variant == "no_mlp" else config.directions)
         self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
         spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
         # Not in files: only training needs it, and makes it anew.

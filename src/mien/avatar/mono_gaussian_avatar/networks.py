@@ -7,6 +7,7 @@ activation, as in figures 14 and 15 of the supplement.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -185,7 +186,7 @@ def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:
     return Layer(torch.cat([layer.weight for layer in layers]), torch.cat([layer.bias for layer in layers]), activation)
 
 
-def _block_diagonal(layers: list[tuple[Tensor, Tensor]]) -> Layer:
+def _block_diagonal(layers: Sequence[tuple[Tensor, Tensor]]) -> Layer:
     """Layers, each of which reads its own columns, as one."""
     return Layer(torch.block_diag(*(weight for weight, _ in layers)), torch.cat([bias for _, bias in layers]))
 
