@@ -26,8 +26,10 @@ from mien.lab.analysis import gaussian_avatars, measuring
 from mien.lab.analysis.gaussian_avatars import binned, jaw_opening, open_jaw, without_teeth
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.result import Chart, Result, Table
+from mien.machine import devices
 from mien.pages.pages import Axes, Series
-from mien.training.run import read_curves
+from mien.training import checkpoint
+from mien.training.run import read_curves, read_training_summary
 from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 from web_case import violations
 
@@ -141,6 +143,26 @@ def test_nothing_is_measured_twice(workspace: Path, monkeypatch: pytest.MonkeyPa
         patched.setattr(train_toy, "SETTINGS", replace(train_toy.SETTINGS, seed=7))
         write_toy_workspace(workspace)
     assert list(analyze(workspace, "--parts", "growth")["parts"]) == ["growth"]
+
+
+def test_parts_train_and_draw_on_a_device(workspace: Path, elsewhere: set[str], monkeypatch) -> None:
+    """In float64 in place of a GPU, whose memory stands beside the paper's 12 GB; that of the host never does."""
+    gpu = {False: 5 * 2**30, True: 0}
+    monkeypatch.setattr(devices, "gpu_memory_mb", lambda device, restart=False: gpu[restart] / 2**20)
+    monkeypatch.setattr(checkpoint, "gpu_memory_mb", devices.gpu_memory_mb)
+    asked = ("--parts", "growth", "speed", "teeth-trained", "scale", "--steps", "2", "--seconds", "0.01")
+    parts = analyze(workspace, *asked, "--device", "auto")["parts"]
+    assert "float64" in elsewhere
+    assert all(row["head_psnr"] > 0 for row in parts["scale"]["values"]["rows"])
+    (run,) = (workspace / "analysis/toy/runs").glob("scale-threshold-2-*")
+    assert read_training_summary(run)["gpu_memory_mb"] == 5120
+    memory = [row for row in parts["growth"]["tables"][0]["rows"] if "Memory" in row[0]]
+    assert [row[1] is None for row in memory] == [True, False]
+    assert [row[2] for row in memory] == ["fits 12 GB", None]
+    shutil.copy(run / "training.json", workspace / "runs/toy")
+    (workspace / "analysis/toy/analysis.json").unlink()
+    memory = analyze(workspace, "--parts", "growth")["parts"]["growth"]["tables"][0]["rows"][-2]
+    assert memory == ["Memory of the GPU in training, most, MB", 5120, "fits 12 GB"]
 
 
 def test_growth_of_known_curves(workspace: Path) -> None:

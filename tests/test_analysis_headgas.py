@@ -51,7 +51,7 @@ workspace = pytest.fixture(lambda toy, tmp_path: Path(shutil.copytree(toy, tmp_p
 
 @pytest.fixture
 def context(toy: Path, tmp_path: Path) -> Context:
-    return Context(toy / "runs/toy", (toy / "sequences/clip",), tmp_path, AnalysisOptions())
+    return Context(toy / "runs/toy", (toy / "sequences/clip",), torch.zeros(()), tmp_path, AnalysisOptions())
 
 
 def analyze(root: Path, *more: str) -> dict[str, Any]:
@@ -93,6 +93,13 @@ def test_the_ablations_are_trained_alike(workspace: Path, capsys: pytest.Capture
     assert part["tables"][0]["rows"][-1][-3:] == [28_000, 4.0, 32.5]
     assert (workspace / "analysis/toy/ablations.png").is_file()
     assert analyze(workspace, *asked)["ablations"] == part
+
+
+def test_ablations_and_sizes_on_a_device(workspace: Path, elsewhere: set[str]) -> None:
+    asked = ("--parts", "sizes", "ablations", "--steps", "2", "--seconds", "0.01", "--device", "auto")
+    rows = analyze(workspace, *asked)["ablations"]["values"]["rows"]
+    assert all(row["frame_ms"] > 0 and row["head_psnr"] > 0 for row in rows)
+    assert "float64" in elsewhere
 
 
 def test_rows_differ_only_in_what_they_say() -> None:

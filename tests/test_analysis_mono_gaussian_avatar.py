@@ -93,6 +93,12 @@ def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.M
         assert torch.equal(tensor, seen[-1][name]), name
 
 
+def test_times_and_stages_on_a_device(workspace: Path, elsewhere: set[str]) -> None:
+    parts = analyze(workspace, "--parts", "times", "convergence", "--steps", "2", "--seconds", "0.01", "--device", "auto")
+    assert parts["convergence"]["values"]["rows"][-1]["head_psnr"] > 0
+    assert "float64" in elsewhere
+
+
 def measured(angles: np.ndarray, expressions: np.ndarray) -> analysis.Measured:
     return analysis.Measured(tuple((0, index) for index in range(len(angles))), angles, expressions)
 

@@ -10,6 +10,7 @@ import tyro
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.lab.analysis.registry import ANALYSES, Analysis, AnalysisOptions, chosen_parts
+from mien.machine.devices import DeviceName, check_device
 
 
 def _about_target() -> str:
@@ -35,6 +36,8 @@ class Command:
     """Number of optimiser steps of each short training."""
     seconds: float = 2.0
     """Seconds to spend on each timed row."""
+    device: DeviceName = "cpu"
+    """Device of short trainings and of timed drawing. cuda takes the figures of a GPU."""
     out: Path | None = None
     """Folder for the result and the short trainings (default: analysis/RUN in the workspace)."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -45,7 +48,8 @@ class Command:
         from mien.disk.files import check_writable
         from mien.disk.reading import check_subtrees
 
-        AnalysisOptions(self.steps, self.seconds).check()
+        self._options().check()
+        check_device(self.device)
         workspace = self._workspace()
         chosen_parts(self._analysis(workspace), self.parts, self.train)
         check_subtrees(workspace.root, "analysis")
@@ -65,14 +69,16 @@ class Command:
         run_dir, folder = workspace.run_dir(run), self._folder(workspace, run)
         analysis = self._analysis(workspace)
         parts = chosen_parts(analysis, self.parts, self.train)
-        options = AnalysisOptions(self.steps, self.seconds)
-        content = run_analysis(analysis, parts, run_dir, run_sequences(workspace, run_dir), folder, options)
+        content = run_analysis(analysis, parts, run_dir, run_sequences(workspace, run_dir), folder, self._options())
         left = [part.name for part in analysis.parts if part.trains and part.name not in content["parts"]]
         if left:
             say(f"not measured, because they train: {', '.join(left)} (--train, or --parts)")
         say(f"Look at {folder / 'analysis.html'}")
         if self.as_json:
             show(json.dumps(content, indent=1))
+
+    def _options(self) -> AnalysisOptions:
+        return AnalysisOptions(self.steps, self.seconds, self.device)
 
     def _workspace(self) -> Workspace:
         if len(self.target) not in (1, 2):

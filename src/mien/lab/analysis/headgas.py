@@ -26,6 +26,7 @@ from mien.lab.analysis.measuring import (
     held_out_scores,
     labeled,
     measure_drawing,
+    measured_on,
     mouth_camera,
     perceptual_metric,
     score_cells,
@@ -34,7 +35,6 @@ from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
 from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
-from mien.machine.terminal import counted
 from mien.media.pictures import picture_grid, side_by_side
 from mien.media.video import write_video
 from mien.pages.pages import Axes, Series
@@ -340,10 +340,11 @@ def view_from(context: Context, trained: Trained, yaw: float) -> Camera:
 
 def sizes(context: Context) -> Result:
     """Milliseconds of a frame with a changed expression, at all threads, against the size of the picture: Fig. 4."""
-    face, machine, seconds = busy_face(context), format_machine(measure_machine()), context.options.seconds
+    face, seconds = busy_face(context), context.options.seconds
+    machine = format_machine(measure_machine(gpu=context.like.is_cuda))
     rows: list[dict[str, Any]] = []
     for side in track_progress(list(SIZES), "sizes", len(SIZES)):
-        row = measure_drawing(context.avatar, context.camera.fitted(side, side), seconds, face)
+        row = measure_drawing(context.timed_avatar, context.camera.fitted(side, side), seconds, face)
         rows.append({**row, "frame_ms": round(row["draw_ms"] + row["pose_ms"], 3), "paper_ms": SIZES[side]})
     cells = [
         (
@@ -353,20 +354,20 @@ def sizes(context: Context) -> Result:
         for row in rows
     ]  # fmt: skip
     heading = ("Width x height", "Frame, ms", "Paper, ms", "Features and network, ms", "Drawing, ms", "Pictures timed")
-    count, threads = len(context.avatar.store), rows[0]["threads"]
+    count, threads, place = len(context.avatar.store), rows[0]["threads"], measured_on(rows[0])
     names = ("width", "frame_ms", "paper_ms")
     sides, ours, paper = (np.array([row[name] for row in rows], np.float64) for name in names)
     slower = rows[-1]["frame_ms"] / max(rows[0]["frame_ms"], 1e-6)
     pixels = (max(SIZES) // min(SIZES)) ** 2
     series = [
-        Series("this run, on a CPU", sides, ours / max(ours[0], 1e-6)),
-        Series("paper, on a GPU", sides, paper / paper[0], "second"),
+        Series(f"this run, {place}", sides, ours / max(ours[0], 1e-6)),
+        Series("paper, a GPU", sides, paper / paper[0], "second"),
     ]
     axes = Axes("side of the picture, pixels", "times the smallest", from_zero=True)
     return Result(
         {"machine": machine, "gaussians": count, "threads": threads, "rows": rows, "slower": round(slower, 3)},
         [
-            f"{count:,} Gaussians, {counted(threads, 'thread')} of a CPU: {rows[0]['frame_ms']:.1f} ms at "
+            f"{count:,} Gaussians, {place}: {rows[0]['frame_ms']:.1f} ms at "
             f"{min(SIZES)}x{min(SIZES)}. With {pixels} times the pixels, a frame takes {slower:.1f} times as long "
             f"(paper, on a GPU: {paper[-1] / paper[0]:.1f} times)."
         ],
@@ -390,7 +391,7 @@ def ablations(context: Context) -> Result:
     camera, face = context.camera.fitted(TIMED_SIDE, TIMED_SIDE), busy_face(context)
     rows: list[dict[str, Any]] = []
     for name, run in runs.items():
-        drawn = measure_drawing(run.avatar, camera, context.options.seconds, face)
+        drawn = measure_drawing(run.timed_avatar, camera, context.options.seconds, face)
         row = {"gaussians": run.summary["gaussians"], "frame_ms": round(drawn["draw_ms"] + drawn["pose_ms"], 2)}
         rows.append({"name": name, **row, **held_out_scores(run, metric)})
     if "no_perceptual" not in configs:

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien import _native
 from mien.avatar.avatar import Avatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.settings import Progress
@@ -23,13 +22,13 @@ from mien.lab.analysis.measuring import (
     held_out_scores,
     labeled,
     measure_drawing,
+    measured_on,
     perceptual_metric,
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Picture, Result, Table
 from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
-from mien.machine.terminal import counted
 from mien.media.pictures import side_by_side
 from mien.pages.pages import Axes, Series
 from mien.perceptual.distance import PerceptualDistance
@@ -54,8 +53,8 @@ GAINS: dict[int, float] = {512: 0.00625, 1024: 0.0025}
 
 def times(context: Context) -> Result:
     """Minutes of this run's training, and milliseconds of a frame with the networks and with the baked avatar."""
-    machine, avatar, threads = format_machine(measure_machine()), context.avatar, _native.thread_count()
-    rows = {}
+    machine, avatar = format_machine(measure_machine(gpu=context.like.is_cuda)), context.timed_avatar
+    rows: dict[str, dict[str, float | int]] = {}
     for name, training in (("networks", True), ("baked", False)):
         avatar.train(training)
         rows[name] = measure_drawing(avatar, context.camera.fitted(SIDE, SIDE), context.options.seconds)
@@ -69,14 +68,14 @@ def times(context: Context) -> Result:
     return Result(
         {
             "machine": machine,
-            "threads": threads,
+            "threads": rows["baked"]["threads"],
             "gaussians": count,
             "training_hours": round(hours, 4),
             "frame_ms": frames,
             "rows": rows,
         },
         [
-            f"{count:,} Gaussians, {counted(threads, 'thread')} of a CPU: training took {60 * hours:.1f} min, and a "
+            f"{count:,} Gaussians, {measured_on(rows['baked'])}: training took {60 * hours:.1f} min, and a "
             f"frame of the baked avatar takes {frames['baked']:.1f} ms at {SIDE}x{SIDE} (paper, on a GPU: 9 h and "
             "30 ms)."
         ],
@@ -131,7 +130,8 @@ def _snapshots(
     context: Context, experiment: Experiment, frames: list[Frame], steps: list[int]
 ) -> list[tuple[int, int, list[Tensor]]]:
     """Step, number of Gaussians and pictures of `frames` at each of some steps, from one training."""
-    settings, sequences = replace(context.settings, steps=context.options.steps), context.sequences
+    settings = replace(context.settings, steps=context.options.steps, device=context.options.device)
+    sequences = context.sequences
     trained = training_frames(sequences, settings)
     extent = camera_extent(sequences, trained)
     snapshots: list[tuple[int, int, list[Tensor]]] = []
@@ -154,9 +154,9 @@ def _snapshots(
 @torch.no_grad()
 def drawn(avatar: Avatar, experiment: Experiment, frame: Frame, progress: Progress) -> Tensor:
     """The avatar's picture of a frame, at this point of its training."""
-    face = experiment.sequences[frame.sequence].tracking.face[frame.timestep]
-    gaussians = avatar.pose(face, progress).gaussians.timestep(0)
-    return rasterize(gaussians, experiment.camera(frame), torch.ones(3)).image
+    face, like = experiment.sequences[frame.sequence].tracking.face[frame.timestep], avatar.face_model.template
+    gaussians = avatar.pose(face.to(like), progress).gaussians.timestep(0)
+    return rasterize(gaussians, experiment.camera(frame).to(like), like.new_ones(3)).image.cpu().float()
 
 
 def resolutions(context: Context) -> Result:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 from mien.disk.config import Range, check_ranges
 from mien.errors import UserError
+from mien.machine.devices import DeviceName
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class AnalysisOptions:
     """Number of optimiser steps of each short training."""
     seconds: Annotated[float, Range(0.01, 3600)] = 2.0
     """Seconds to spend on each timed row. A row ends after the first picture that exceeds them."""
+    device: DeviceName = "cpu"
+    """Device of short trainings and of timed drawing. Pictures and scores are drawn on the CPU."""
 
     def check(self) -> None:
         """Check that all numbers are in their ranges."""
