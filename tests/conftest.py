@@ -135,8 +135,8 @@ def _holder() -> "Iterator[Holder]":
 @pytest.fixture
 def elsewhere(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Let analyses train and draw in float64 in place of a GPU, and return the dtypes of what is drawn by the clock."""
-    from mien.lab.analysis import measuring, mono_gaussian_avatar, running
     from mien.avatar.avatar import move_avatar
+    from mien.lab.analysis import measuring, mono_gaussian_avatar, running
     from mien.training import run, trainer
 
     drawn, rasterize, write_avatar, write_tensors = set[str](), measuring.rasterize, run.write_avatar, run.write_tensors
@@ -147,6 +147,7 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
     for module in (measuring, mono_gaussian_avatar):
         monkeypatch.setattr(module, "rasterize", draw)
+
     # Files have float32, as those of a GPU.
     def write(folder, avatar):
         move_avatar(copied := deepcopy(avatar), torch.zeros(()))

@@ -238,7 +238,8 @@ def test_tables_and_charts_of_any_analysis_are_read_again(workspace: Path, monke
 BAD = [
     ("gaussian-avatars gone", "gone: no such folder"),
     ("gaussian-avatars", "mien: gaussian-avatars: no such folder"),
-    ("headgas W more", "takes a workspace"),
+    ("W more", "more: no such folder"),
+    ("headgas W W", "W: two workspaces have this name"),
     ("gaussian-avatars W --run none", "no run 'none'; there are: begun, foreign, other, toy"),
     ("gaussian-avatars W --run toy --steps 0", "--steps 0: give a number from 1 to 1000000"),
     ("gaussian-avatars W --run toy --out /proc/a", "/proc/a: cannot be written"),

@@ -1,11 +1,12 @@
 """The analysis of HeadGaS (Dhamo et al., ECCV 2024): the figures and the ablation table of the paper's supplement."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Any, get_args
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +15,9 @@ from torch import Tensor
 from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.camera import Camera
+from mien.errors import UserError
 from mien.evaluation.experiment import avatar_image, target_image
+from mien.evaluation.metrics import crop_to
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, world_means
@@ -27,6 +30,7 @@ from mien.lab.analysis.measuring import (
     labeled,
     measure_drawing,
     measured_on,
+    mouth_box,
     mouth_camera,
     perceptual_metric,
     score_cells,
@@ -40,10 +44,14 @@ from mien.media.video import write_video
 from mien.pages.pages import Axes, Series
 from mien.render.camera_paths import turned_camera
 from mien.runtime.filmed import head_angles
+from mien.training.footage.sequence import Sequence as TrainedSequence
+from mien.training.run import read_face_track
 
 SIDE = 224
 """Width and height of a picture, in pixels."""
 _FPS = 25.0
+_INNER_LIPS, _EYE_CORNERS = (13, 14), (33, 263)
+"""Landmarks in the middle of the inner lips, and at the outer eye corners."""
 _FAINT = 1 / 255
 """Opacity below which a Gaussian is not drawn."""
 _REACH = 1.4
@@ -176,18 +184,20 @@ def start_of_bases(subject: FaceParams, model: FaceModel) -> tuple[FaceParams, i
 
 
 def layers(context: Context) -> Result:
-    """The avatar at rest, and its mouth, without the nearest Gaussians: Fig. 2."""
+    """The avatar at rest, and its mouth in a filmed frame with shut lips, without the nearest Gaussians: Fig. 2."""
     avatar, model, subject = context.avatar, context.avatar.face_model, context.avatar.subject
-    with torch.no_grad():
-        gaussians = avatar.pose(subject).gaussians.timestep(0)
+    shut, told, truth = _shut_frame(context)
+    face, filming = (subject, context.camera) if shut is None else shut
     views = {
-        "head": head_camera(model, subject, context.camera, SIDE),
-        "mouth": mouth_camera(model, subject, context.camera, SIDE),
+        "head": (subject, head_camera(model, subject, context.camera, SIDE)),
+        "mouth": (face, mouth_camera(model, face, filming, SIDE)),
     }
-    orders = {name: near_to_far(gaussians, camera) for name, camera in views.items()}
+    with torch.no_grad():
+        posed = {name: avatar.pose(one).gaussians.timestep(0) for name, (one, _) in views.items()}
+    orders, gaussians = {name: near_to_far(posed[name], views[name][1]) for name in views}, posed["head"]
 
     def without(name: str, share: float) -> np.ndarray:
-        return draw_avatar(avatar, subject, views[name], without_nearest(len(gaussians), orders[name], share))
+        return draw_avatar(avatar, *views[name], without_nearest(len(gaussians), orders[name], share))
 
     def film() -> Iterator[np.ndarray]:
         for frame in range(75):
@@ -199,7 +209,9 @@ def layers(context: Context) -> Result:
         values[f"in_{name}"] = len(order)
         shares = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
         drawn = [labeled(without(name, share), f"without {100 * share:.0f} %") for share in shares]
-        caption = f"The {name} of the person at rest, without the nearest Gaussians among the {len(order):,} in view."
+        at = told if name == "mouth" else "The head of the person at rest"
+        drawn = [*(truth if name == "mouth" else ()), *drawn]
+        caption = f"{at}, without the nearest Gaussians among the {len(order):,} in view."
         pictures.append(Picture(f"layers-{name}", side_by_side(drawn), caption))
     write_video(context.folder / "layers.mp4", film(), _FPS)
     return Result(
@@ -211,12 +223,49 @@ def layers(context: Context) -> Result:
         pictures=pictures,
         films=[Film("layers.mp4", "Head and mouth, while up to half of the Gaussians in view are removed.")],
         notes=[
-            "The supplement finds teeth behind closed lips. Look whether they appear here too: that needs frames with "
-            "visible teeth.",
+            "The supplement finds teeth behind closed lips. Look whether they appear here too: that needs other frames "
+            "with visible teeth.",
             "Only Gaussians that are drawn and whose centre is in the picture count. White shows through where no "
             "Gaussian is behind, because no frame shows what is there.",
         ],
     )
+
+
+def _shut_frame(context: Context) -> tuple[tuple[FaceParams, Camera] | None, str, list[np.ndarray]]:
+    """Face and camera of the frame with shut lips (None: nothing tells), what it is, and its picture of the mouth."""
+    try:
+        place, reason = shut_lips(context.sequences), "no picture has landmarks"
+    except UserError as error:
+        place, reason = None, str(error)
+    if place is None:
+        return None, f"The mouth of the person at rest ({reason})", []
+    index, timestep = place
+    sequence, model = context.sequences[index], context.avatar.face_model
+    before = sum(len(one.tracking.face) for one in context.sequences[:index])
+    face = read_face_track(context.run_dir, model)[before + timestep]
+    left, top, width, _ = mouth_box(model, face, camera := sequence.tracking.cameras[0])
+    picture = crop_to(torch.from_numpy(np.array(sequence.capture.images[timestep, 0])), (left, top, width, width))
+    picture = cv2.resize(picture.numpy(), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    told = f"The mouth in {sequence.name}, timestep {timestep}, whose lips are shut: as filmed, then the avatar"
+    return (face, camera), told, [labeled(picture, "filmed")]
+
+
+def shut_lips(sequences: Sequence[TrainedSequence]) -> tuple[int, int] | None:
+    """Sequence and timestep with shut lips: the most frontal view among the tenth whose lips are least apart.
+
+    The gap between the lips is that of the landmarks in the first camera's pictures, relative to the distance of the
+    outer eye corners. None if no picture has landmarks.
+    """
+    found = []
+    for index, one in enumerate(sequences):
+        marks, face = one.capture.landmarks[:, 0].astype(np.float64), one.tracking.face
+        inner, corners = (np.linalg.norm(marks[:, a] - marks[:, b], axis=1) for a, b in (_INNER_LIPS, _EYE_CORNERS))
+        eye = one.tracking.cameras[0].position.numpy()
+        turned = np.linalg.norm(head_angles(face.head_rotation.numpy(), face.head_translation.numpy(), eye), axis=1)
+        for timestep in np.flatnonzero(one.usable()[:, 0] & np.isfinite(inner) & (corners > 0)).tolist():
+            found.append((inner[timestep] / corners[timestep], turned[timestep], index, timestep))
+    least = sorted(found)[: max(1, len(found) // 10)]
+    return min(least, key=lambda each: each[1])[2:] if least else None
 
 
 def near_to_far(gaussians: Gaussians, camera: Camera) -> Int[Tensor, " p"]:

@@ -160,9 +160,10 @@ def drawn(avatar: Avatar, experiment: Experiment, frame: Frame, progress: Progre
 
 
 def resolutions(context: Context) -> Result:
-    """The same short training with pictures of the run's size and of half of it, both scored at full size: A.1.
+    """The same short training with pictures of 1024 and of 512 pixels, both scored at the capture's size: A.1.
 
-    Each has the paper's bound of scales for the size that is nearest to its own.
+    Each has the paper's bound of scales for the size that is nearest to its own. A smaller capture is trained at its
+    own size and at half of it.
     """
     config = context.avatar.config
     assert isinstance(config, MonoGaussianAvatarConfig)
@@ -170,7 +171,8 @@ def resolutions(context: Context) -> Result:
     full = min(context.settings.resolution or capture, capture)
     context.say_how_long("resolutions", 2)
     runs, rows, (metric, notes) = {}, [], perceptual_metric()
-    for side in (full, max(16, full // 2)):
+    small = full < max(GAINS)
+    for side in (full, max(16, full // 2)) if small else (max(GAINS), min(GAINS)):
         name, gain = f"{side} pixels", scale_gain(side)
         runs[name] = context.train(f"resolution-{side}", replace(config, scale_gain=gain), resolution=side)
         rows.append({"name": name, "side": side, "scale_gain": gain, **_scored(runs[name], metric)})
@@ -183,7 +185,9 @@ def resolutions(context: Context) -> Result:
         pictures=_pictures("resolutions", runs),
         notes=[
             "The paper trains at 512x512 and at 1024x1024, and gives scales a smaller bound at 1024x1024. Here, each "
-            "training has the bound of the nearer of these sizes; all else is as in the run.",
+            "training has the bound of the nearer of these sizes; all else is as in the run, which has the paper's "
+            "settings if it was trained with --preset paper or paper-cpu.",
+            *([f"The pictures have {full} pixels; --capture.size 1024 gives more, if the video has them."] * small),
             *notes,
         ],
     )
@@ -195,10 +199,12 @@ def scale_gain(side: int) -> float:
 
 
 def diversity(context: Context) -> Result:
-    """The same short training on all frames, on a frontal quarter, and on half with all poses and expressions: A.4."""
+    """The same short training on all frames, on two clips by time as in the paper, and on two choices by pose: A.4."""
     measured = measure(context.sequences, training_frames(context.sequences, context.settings))
     subsets = {
         "all frames": list(range(len(measured.timesteps))),
+        "frontal clip": clip(measured, 0.25, mixed=False),
+        "mixed clip": clip(measured, 0.5, mixed=True),
         "frontal quarter": frontal_quarter(measured),
         "mixed half": mixed_half(measured),
     }
@@ -221,7 +227,9 @@ def diversity(context: Context) -> Result:
         [Table(heading, cells, "Scores are those of the head crop, means over the same held-out frames.")],
         pictures=_pictures("diversity", runs),
         notes=[
-            "The frontal quarter has the views nearest to the median one. Each timestep of the mixed half is the one "
+            "The paper has a frontal clip of 30 s and a mixed one of 60 s, of 120 s. Here, they are successive timesteps, "
+            "a quarter and half of all: where views are nearest to the median one, and where they vary most.",
+            "The frontal quarter has the single views nearest to the median one. Each timestep of the mixed half is the one "
             "that differs most, in tracked pose and expression, from those chosen before it. Ranges of angles are "
             "between the 2nd and the 98th percentile; the spread of expressions is relative to all frames.",
             "All trainings have the same number of steps, so that those on fewer frames see each more often.",
@@ -288,9 +296,26 @@ def measure(sequences: list[Sequence], frames: list[Frame]) -> Measured:
 
 def frontal_quarter(measured: Measured) -> list[int]:
     """The quarter of the timesteps whose view is nearest to the median one, in the order of time."""
-    distance = np.linalg.norm(measured.angles - np.median(measured.angles, axis=0), axis=1)
+    distance = _from_the_front(measured)
     count = max(1, round(0.25 * len(distance)))
     return sorted(np.argsort(distance, kind="stable")[:count].tolist())
+
+
+def clip(measured: Measured, share: float, *, mixed: bool) -> list[int]:
+    """Successive timesteps, `share` of all: those with the views nearest to the median one, or with the most varied."""
+    distance = _from_the_front(measured)
+    count = max(1, round(share * len(distance)))
+
+    def worth(first: int) -> float:
+        part = slice(first, first + count)
+        return float(measured.angles[part].std(0).sum() if mixed else -distance[part].mean())
+
+    first = max(range(len(distance) - count + 1), key=worth)
+    return list(range(first, first + count))
+
+
+def _from_the_front(measured: Measured) -> Float[np.ndarray, " n"]:
+    return np.linalg.norm(measured.angles - np.median(measured.angles, axis=0), axis=1)
 
 
 def mixed_half(measured: Measured) -> list[int]:

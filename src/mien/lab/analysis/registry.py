@@ -74,7 +74,7 @@ _ALL = (
         "HeadGaS (Dhamo et al., ECCV 2024), supplement",
         (
             Part("basis", "What the bases learned: one expression at a time, beside the mesh (Fig. 1)"),
-            Part("layers", "Gaussians removed from near to far (Fig. 2)"),
+            Part("layers", "Gaussians removed from near to far, also of a mouth that is shut (Fig. 2)"),
             Part("beyond", "Beyond the expressions and the views of training (Fig. 3)"),
             Part("sizes", "Time of a frame against the size of the picture (Fig. 4)", timed=True),
             Part("ablations", "The ablations, trained alike (Table 1)", trains=True, timed=True),
@@ -86,8 +86,8 @@ _ALL = (
         (
             Part("times", "Time of training and of a frame (Table 4)", timed=True),
             Part("convergence", "Held-out pictures during a training (Fig. 13)", trains=True),
-            Part("resolutions", "Training at two resolutions (A.1)", trains=True),
-            Part("diversity", "Fewer and less varied frames (A.4)", trains=True),
+            Part("resolutions", "Training at 1024x1024 and 512x512 (A.1)", trains=True),
+            Part("diversity", "Shorter and less varied clips (Fig. 12, A.4)", trains=True),
         ),
     ),
 )
