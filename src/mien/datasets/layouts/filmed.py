@@ -133,6 +133,24 @@ def as_flame(
     return whole, held, *motion_between(face_of_flame(folder, filmed.face_model, held), face)
 
 
+def vectors(filmed: Filmed, count: int) -> tuple[Float[np.ndarray, "t n"], tuple[str, ...]]:
+    """Return `count` numbers a timestep in place of a foreign model's expressions, and what is said of them."""
+    face, model = filmed.face(), filmed.face_model
+    moved = [name for name in model.free_joint_names if name != "neck"]
+    joints = [face.joints[:, model.free_joint_names.index(name)] for name in moved]
+    room = count - 3 * len(joints)
+    values = face.expression.double().numpy()
+    kept = min(room, values.shape[1])
+    columns = [values[:, :kept], *(joint.double().numpy() for joint in joints)]
+    told = (
+        f"expression: {kept} expression coefficients of {model.name}, then axis-angles of "
+        f"{', '.join(moved) or 'no joint'}, then zeros. They are not the {count} of the layout's own model.",
+        "Lost: the neck joint, identity and the mesh itself.",
+        *lost_words("expression", values, room),
+    )
+    return padded(np.concatenate(columns, axis=1), count), told
+
+
 def padded(values: np.ndarray, count: int) -> np.ndarray:
     """Return coefficients with `count` columns: zeros are added, and those beyond are left out."""
     whole = np.zeros((*values.shape[:-1], count))
