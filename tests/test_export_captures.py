@@ -346,7 +346,11 @@ def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch
         assert message in line
 
     refused("--benchmark is an option of --format nersemble-benchmark", "--format", "insta", "--benchmark", "393")
-    refused("choose insta, imavatar, nerface, nerf-blendshape, avatar-mav, nersemble or nersemble-benchmark", "--format", "inst")
+    refused(
+        "choose insta, imavatar, nerface, nerf-blendshape, avatar-mav, nersemble or nersemble-benchmark",
+        "--format",
+        "inst",
+    )
     refused("there is no run yet", "--format", "insta", "--run", "me")
     refused("no sequence 'other'", "--format", "insta", "--sequence", "other")
     refused("--split dataset: the sequence clip has no split", "--format", "insta", "--split", "dataset")

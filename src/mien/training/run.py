@@ -209,7 +209,7 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
 
 
 def read_training_summary(run_dir: Path) -> dict[str, Any]:
-    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run; `gpu_memory_mb` of one on a GPU."""
+    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run; on a GPU also `gpu_memory_mb`."""
     if (run_dir / "config.json").is_file() and not is_finished(run_dir):
         raise UserError(
             f"{run_dir}: its training was not finished; run the same `mien train` or `mien create` again, which goes "

@@ -29,7 +29,7 @@ class Written:
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout of files. Its writer is the function `write` of the file in this folder with its name, in underscores."""
+    """A layout of files. Its writer is the function `write` of the file with its name, in underscores."""
 
     name: str
     """Name for `mien export-dataset --format`."""

@@ -81,8 +81,8 @@ def growth(context: Context) -> Result:
         "Step times are medians: over the steps with at most 5 % more Gaussians than at the start, and over those with "
         "at least 95 % of the most. Other work on the machine during training changes them.",
         "The paper's figures are those of section C of its supplement, for 600,000 steps on a GPU.",
-        "Memory of the GPU is that of all tensors, and is not measured in a training on a CPU; memory of the host is that "
-        "of the whole process, libraries and pictures included.",
+        "Memory of the GPU is that of all tensors on it; a training on a CPU has none. That of the host is of the "
+        "whole process, libraries and pictures included.",
         *_doubts(at_peak, peak, config.density.max_gaussians),
     ]
     charts = _growth_charts(steps, gaussians, times, few)
@@ -201,7 +201,7 @@ def speed(context: Context) -> Result:
             "A frame is posed and drawn from the camera of training, fitted into the picture, over white. Times are "
             f"medians; each row took about {seconds:g} s.",
             "The paper does not name the GPU of Table 3. Its model has about 100,000 Gaussians.",
-            "Memory added is the largest memory of the process, or of the tensors on a GPU, in drawing, less that before.",
+            "Memory added is the largest while drawing, less that before: of the process, or of the tensors on a GPU.",
         ],
     )
 

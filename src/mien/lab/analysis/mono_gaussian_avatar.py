@@ -227,11 +227,11 @@ def diversity(context: Context) -> Result:
         [Table(heading, cells, "Scores are those of the head crop, means over the same held-out frames.")],
         pictures=_pictures("diversity", runs),
         notes=[
-            "The paper has a frontal clip of 30 s and a mixed one of 60 s, of 120 s. Here, they are successive timesteps, "
-            "a quarter and half of all: where views are nearest to the median one, and where they vary most.",
-            "The frontal quarter has the single views nearest to the median one. Each timestep of the mixed half is the one "
-            "that differs most, in tracked pose and expression, from those chosen before it. Ranges of angles are "
-            "between the 2nd and the 98th percentile; the spread of expressions is relative to all frames.",
+            "The paper has a frontal clip of 30 s and a mixed one of 60 s, of 120 s. Here, they are successive "
+            "timesteps, a quarter and half of all: with the views nearest to the median one, and with the most varied.",
+            "The frontal quarter has the single views nearest to the median one. Each timestep of the mixed half is "
+            "the one that differs most, in tracked pose and expression, from those chosen before it. Ranges of angles "
+            "are between the 2nd and the 98th percentile; the spread of expressions is relative to all frames.",
             "All trainings have the same number of steps, so that those on fewer frames see each more often.",
             *notes,
         ],
