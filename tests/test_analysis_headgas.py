@@ -91,12 +91,12 @@ def test_several_subjects_are_joined_to_statistics(toy: Path, tmp_path: Path, ca
     assert found["subjects"] == ["anna", "ben", "carl"]
     assert list(found["parts"]) == ["sizes"], "layers have no figures to join"
     records = [json.loads((tmp_path / "out" / name / "analysis.json").read_text()) for name in found["subjects"]]
-    rows = {(row["row"], row["figure"]): row for row in found["parts"]["sizes"]["values"]["rows"]}
+    rows = {(row["row"], row["figure"]): row for row in found["parts"]["sizes"]}
     for index, size in enumerate(("16x16", "32x32")):
         own = [record["parts"]["sizes"]["values"]["rows"][index]["frame_ms"] for record in records]
         wanted = {"subjects": 3, "mean": pytest.approx(sum(own) / 3), "least": min(own), "largest": max(own)}
         assert rows[size, "frame_ms"] == {"row": size, "figure": "frame_ms", **wanted}
-    assert "Paper: frame, ms" in (tmp_path / "out/joined.html").read_text()
+    assert "| 32x32 | Paper: frame, ms | 3 | 8 | 8 | 8 |" in (tmp_path / "out/joined.md").read_text()
     several = [{"values": {"rows": [{"name": "full", "head_psnr": psnr}]}} for psnr in (30.0, None, 31.0)]
     assert [(row["subjects"], row["mean"]) for row in joined_rows(several)] == [(2, 30.5)]
 

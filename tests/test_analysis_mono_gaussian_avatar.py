@@ -73,6 +73,11 @@ def test_short_trainings_write_their_pictures(workspace: Path, monkeypatch: pyte
     assert [len({row["head_psnr"] for row in rows}) for rows in (shown, sides)] == [4, 2]
     assert subsets[0]["head_psnr"] == sides[0]["head_psnr"], "all frames at full size is the same training in both"
     assert analyze(workspace, *asked) == parts
+    # A capture with more pixels than the paper's is trained at the paper's two sizes.
+    monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {8: 0.004, 16: 0.00625})
+    shutil.rmtree(workspace / "analysis")
+    sides = analyze(workspace, "--parts", "resolutions", "--steps", "2")["resolutions"]["values"]["rows"]
+    assert [(row["side"], row["scale_gain"]) for row in sides] == [(16, 0.00625), (8, 0.004)]
 
 
 @pytest.mark.slow

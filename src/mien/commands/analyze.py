@@ -25,7 +25,7 @@ class Command:
     """Measure on a run what the paper of its method measures, and show it beside the paper's figures.
 
     Writes analysis.html (one page), analysis.json, a .svg for each chart and a .png for each picture, and of several
-    workspaces joined.html and joined.json. A stopped command continues, and what is measured is not measured again.
+    workspaces joined.md and joined.json. A stopped command continues, and what is measured is not measured again.
     """
 
     target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR [DIR ...]"), _about_target]
@@ -43,7 +43,7 @@ class Command:
     """Device of short trainings and of timed drawing. cuda takes the figures of a GPU."""
     out: Path | None = None
     """Folder for the result and the short trainings (default: analysis/RUN in the workspace). Several workspaces have
-    folders of their names in it (default: joined.html is in analysis of the first)."""
+    folders of their names in it (default: joined.md is in analysis of the first)."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the content of analysis.json on standard output, for programs."""
 
@@ -85,7 +85,7 @@ class Command:
         if len(workspaces) > 1:
             folder = self.out or workspaces[0].root / "analysis"
             content = join_analyses(analysis, contents, folder)
-            say(f"Look at {folder / 'joined.html'}")
+            say(f"Look at {folder / 'joined.md'}")
         if self.as_json:
             show(json.dumps(content, indent=1))
 

@@ -16,7 +16,7 @@ from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.camera import Camera
 from mien.errors import UserError
-from mien.evaluation.experiment import avatar_image, target_image
+from mien.evaluation.experiment import Experiment
 from mien.evaluation.metrics import crop_to
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
@@ -25,7 +25,6 @@ from mien.lab.analysis.measuring import (
     draw_avatar,
     draw_mesh,
     head_camera,
-    head_picture,
     held_out_scores,
     labeled,
     measure_drawing,
@@ -33,10 +32,11 @@ from mien.lab.analysis.measuring import (
     mouth_box,
     mouth_camera,
     perceptual_metric,
+    picture_of_runs,
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
-from mien.lab.analysis.running import Context, Run
+from mien.lab.analysis.running import Context
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.media.pictures import picture_grid, side_by_side
@@ -44,6 +44,7 @@ from mien.media.video import write_video
 from mien.pages.pages import Axes, Series
 from mien.render.camera_paths import turned_camera
 from mien.runtime.filmed import head_angles
+from mien.training.footage.frames import Frame
 from mien.training.footage.sequence import Sequence as TrainedSequence
 from mien.training.run import read_face_track
 
@@ -460,7 +461,7 @@ def ablations(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         ablation_findings(config, context.options.steps, rows),
         [Table(heading, cells, "Scores are those of the head crop, means over held-out frames.")],
-        pictures=_ablation_picture(runs),
+        pictures=picture_of_runs("ablations", runs, _strongest),
         notes=[
             f"All trainings have the same data, settings, seed and {context.options.steps:,} steps, which shorten all "
             "schedules alike. The paper trains 50,000.",
@@ -507,17 +508,7 @@ def ablation_findings(config: HeadGasConfig, steps: int, rows: list[dict[str, An
     return findings
 
 
-def _ablation_picture(runs: dict[str, Run]) -> list[Picture]:
-    """The held-out frame with the strongest expression: the truth, then each variant."""
-    first = runs["full"].experiment
-    if first is None:
-        return []
-    rest = first.avatar.subject.expression
-    frame = max(first.held_out_frames, key=lambda frame: float((first.face(frame).expression - rest).norm()))
-    tiles = [labeled(head_picture(first, frame, target_image(first, frame)), "truth")]
-    for name, run in runs.items():
-        assert run.experiment is not None
-        tiles.append(labeled(head_picture(run.experiment, frame, avatar_image(run.experiment, frame)), name))
-    sequence = first.sequences[frame.sequence].name
-    caption = f"{sequence}, timestep {frame.timestep}, held out: the truth, and each variant."
-    return [Picture("ablations", side_by_side(tiles), caption)]
+def _strongest(experiment: Experiment) -> Frame:
+    """The held-out frame with the strongest expression."""
+    rest = experiment.avatar.subject.expression
+    return max(experiment.held_out_frames, key=lambda frame: float((experiment.face(frame).expression - rest).norm()))

@@ -1,19 +1,14 @@
 """Statistics over subjects: the same analysis of several runs, joined to one table."""
 
 import json
-import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import mien
 from mien.disk.files import write_atomically, write_json
-from mien.disk.locks import hold
 from mien.lab.analysis.registry import Analysis
-from mien.lab.analysis.result import Result, Table, section_html
-from mien.pages.pages import render
+from mien.lab.benchmarking.comparing import markdown
 
 FIGURES = {
     "gaussians": "Gaussians", "frame_ms": "Frame, ms", "paper_ms": "Paper: frame, ms", "fps": "Frames/s",
@@ -43,27 +38,18 @@ def joined_rows(parts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def join_analyses(analysis: Analysis, contents: Mapping[str, Mapping[str, Any]], folder: Path) -> dict[str, Any]:
-    """Write joined.json and joined.html into a folder, from the content of each subject's analysis.json by its name."""
-    content: dict[str, Any] = {"method": analysis.method, "subjects": list(contents), "parts": {}}
-    sections = []
+    """Write joined.json and joined.md into a folder, from the content of each subject's analysis.json by its name."""
+    parts, lines = {}, []
     for part in analysis.parts:
-        found = [each["parts"][part.name] for each in contents.values() if part.name in each["parts"]]
-        if not (rows := joined_rows(found)):
-            continue
-        cells = [(one["row"], FIGURES[one["figure"]], one["subjects"], *(float(f"{one[of]:.5g}") for of in _KINDS))
-                 for one in rows]  # fmt: skip
-        result = Result({"rows": rows}, tables=[Table(("", "Figure", "Subjects", *map(str.title, _KINDS)), cells)])
-        content["parts"][part.name] = json.loads(json.dumps(result.write(folder)))
-        sections.append(section_html(part.title, content["parts"][part.name], folder))
-    page = render(
-        "lab/analysis/templates/analysis.html", title=", ".join(contents), paper=analysis.paper,
-        version=mien.__version__, command=shlex.join(["mien", *sys.argv[1:]]), sections=sections,
-    )  # fmt: skip
-    with hold(folder / "joined"):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "joined.json", "mien.joined_analyses", 1, content)
-        write_atomically(folder / "joined.html", lambda aside: aside.write_text(page, encoding="utf-8"))
-    return content
-
-
-_KINDS = ("mean", "least", "largest")
+        rows = joined_rows([each["parts"][part.name] for each in contents.values() if part.name in each["parts"]])
+        if rows:
+            parts[part.name] = rows
+        for row in rows:
+            figures = (f"{row[kind]:,.5g}" for kind in ("mean", "least", "largest"))
+            lines.append((part.title, row["row"], FIGURES[row["figure"]], str(row["subjects"]), *figures))
+    content = {"method": analysis.method, "subjects": list(contents), "parts": parts}
+    table = markdown(("part", "row", "figure", "subjects", "mean", "least", "largest"), lines)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "joined.json", "mien.joined_analyses", 1, content)
+    write_atomically(folder / "joined.md", lambda aside: aside.write_text(table, encoding="utf-8"))
+    return json.loads(json.dumps(content))

@@ -1,7 +1,7 @@
 """What the parts of analyses measure and draw: time and memory of drawing, scores of held-out frames, views, labels."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -21,12 +21,13 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.scoring import score_pictures
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.lab.analysis.result import Picture
 from mien.lab.analysis.running import Run
 from mien.machine.devices import gpu_memory_mb
 from mien.machine.system import peak_memory_mb
 from mien.machine.terminal import counted
 from mien.machine.threads import one_torch_thread
-from mien.media.pictures import WHITE, to_uint8
+from mien.media.pictures import WHITE, side_by_side, to_uint8
 from mien.perceptual.distance import PerceptualDistance, load_perceptual
 from mien.render import rasterize
 from mien.render.mesh import Headlight, render_mesh
@@ -170,6 +171,21 @@ def mean_psnr(experiment: Experiment, frames: Sequence[Frame]) -> float:
 def head_picture(experiment: Experiment, frame: Frame, image: Tensor) -> UInt8[np.ndarray, "_ _ 3"]:
     """The head crop of a picture of a frame."""
     return to_uint8(crop_to(image, experiment.crop(frame)))
+
+
+def picture_of_runs(name: str, runs: Mapping[str, Run], chosen: Callable[[Experiment], Frame]) -> list[Picture]:
+    """A held-out frame, which is chosen in the first run: the truth, then each run. None if nothing was held out."""
+    tiles, caption, frame = [], "", None
+    for label, run in runs.items():
+        if (experiment := run.experiment) is None:
+            return []
+        if frame is None:
+            frame = chosen(experiment)
+            tiles.append(labeled(head_picture(experiment, frame, target_image(experiment, frame)), "truth"))
+            place = f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}"
+            caption = f"{place}, held out: the truth, then each training."
+        tiles.append(labeled(head_picture(experiment, frame, avatar_image(experiment, frame)), label))
+    return [Picture(name, side_by_side(tiles), caption)]
 
 
 def zoomed(camera: Camera, box: Box, side: int) -> Camera:

@@ -15,7 +15,7 @@ from mien.avatar.avatar import Avatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.settings import Progress
 from mien.errors import UserError
-from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import psnr
 from mien.lab.analysis.measuring import (
     head_picture,
@@ -24,6 +24,7 @@ from mien.lab.analysis.measuring import (
     measure_drawing,
     measured_on,
     perceptual_metric,
+    picture_of_runs,
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Picture, Result, Table
@@ -130,8 +131,7 @@ def _snapshots(
     context: Context, experiment: Experiment, frames: list[Frame], steps: list[int]
 ) -> list[tuple[int, int, list[Tensor]]]:
     """Step, number of Gaussians and pictures of `frames` at each of some steps, from one training."""
-    settings = replace(context.settings, steps=context.options.steps, device=context.options.device)
-    sequences = context.sequences
+    settings, sequences = context.short_settings, context.sequences
     trained = training_frames(sequences, settings)
     extent = camera_extent(sequences, trained)
     snapshots: list[tuple[int, int, list[Tensor]]] = []
@@ -182,7 +182,7 @@ def resolutions(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         [_finding(rows)],
         [Table(heading, cells, "Scores are those of the head crop at full size, means over held-out frames.")],
-        pictures=_pictures("resolutions", runs),
+        pictures=picture_of_runs("resolutions", runs, _middle),
         notes=[
             "The paper trains at 512x512 and at 1024x1024, and gives scales a smaller bound at 1024x1024. Here, each "
             "training has the bound of the nearer of these sizes; all else is as in the run, which has the paper's "
@@ -225,7 +225,7 @@ def diversity(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         [_finding(rows)],
         [Table(heading, cells, "Scores are those of the head crop, means over the same held-out frames.")],
-        pictures=_pictures("diversity", runs),
+        pictures=picture_of_runs("diversity", runs, _middle),
         notes=[
             "The paper has a frontal clip of 30 s and a mixed one of 60 s, of 120 s. Here, they are successive "
             "timesteps, a quarter and half of all: with the views nearest to the median one, and with the most varied.",
@@ -255,17 +255,8 @@ def _finding(rows: list[dict[str, Any]]) -> str:
     return f"PSNR of the head crop: {rows[0]['name']} {first:.2f} dB; compared with it, {others}."
 
 
-def _pictures(name: str, runs: dict[str, Run]) -> list[Picture]:
-    """A held-out frame in the middle of those: the truth, then each training."""
-    tiles = []
-    for label, run in runs.items():
-        if (experiment := run.experiment) is None:
-            return []
-        frame = experiment.held_out_frames[len(experiment.held_out_frames) // 2]
-        if not tiles:
-            tiles.append(labeled(head_picture(experiment, frame, target_image(experiment, frame)), "truth"))
-        tiles.append(labeled(head_picture(experiment, frame, avatar_image(experiment, frame)), label))
-    return [Picture(name, side_by_side(tiles), "A held-out frame: the truth, then each training.")]
+def _middle(experiment: Experiment) -> Frame:
+    return experiment.held_out_frames[len(experiment.held_out_frames) // 2]
 
 
 @dataclass(frozen=True, eq=False)

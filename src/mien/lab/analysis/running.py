@@ -32,7 +32,7 @@ from mien.evaluation.load import load_experiments
 from mien.face.model import FaceModel
 from mien.lab.analysis.registry import Analysis, AnalysisOptions, Part
 from mien.lab.analysis.result import section_html
-from mien.machine.devices import choose_device, like_on
+from mien.machine.devices import DeviceName, choose_device, like_on
 from mien.machine.progress import say
 from mien.pages.pages import render
 from mien.plugins import named
@@ -113,6 +113,12 @@ class Context(Run):
     """Pictures and films are written here, short trainings below `runs/`."""
     options: AnalysisOptions
 
+    @cached_property
+    def short_settings(self) -> TrainSettings:
+        """The run's settings for `options.steps` steps on the chosen device."""
+        device: DeviceName = "cuda" if self.like.is_cuda else "cpu"
+        return replace(self.settings, steps=self.options.steps, device=device)
+
     def train(
         self,
         name: str,
@@ -127,7 +133,7 @@ class Context(Run):
         pictures, in pixels, and `timesteps` are those of each sequence that may be trained on; None is all.
         """
         model = face_model or self.avatar.face_model
-        settings = replace(self.settings, steps=self.options.steps, checkpoint_every=250, device="cpu")
+        settings = replace(self.short_settings, checkpoint_every=250)
         if resolution is not None:
             settings = replace(settings, resolution=resolution)
         key = [encode(config), encode(settings), self.config["data"], model.content_hash]
@@ -139,7 +145,7 @@ class Context(Run):
         if timesteps is not None:
             trackings = [replace(one, valid=one.valid & some) for one, some in zip(trackings, timesteps, strict=True)]
         sequences = [replace(one, tracking=own) for one, own in zip(self.sequences, trackings, strict=True)]
-        train(sequences, model, config, replace(settings, device=self.options.device), run_dir)
+        train(sequences, model, config, settings, run_dir)
         return Run(run_dir, self.sequence_dirs, self.like)
 
     def say_how_long(self, part: str, trainings: int) -> None:
@@ -189,11 +195,10 @@ def run_analysis(
             "mien": mien.__version__,
             "command_line": sys.argv,
         }
-        like = like_on(choose_device(options.device))
-        context = Context(run_dir, tuple(sequence_dirs), like, folder, options)
+        context = Context(run_dir, tuple(sequence_dirs), like_on(choose_device(options.device)), folder, options)
         for part in parts:
             timed = [options.seconds, _native.thread_count()] if part.timed else None
-            device = like.device.type if part.timed or part.trains else None
+            device = context.like.device.type if part.timed or part.trains else None
             key = _digest_of([part.name, avatar, options.steps if part.trains else None, timed, device])
             if content["parts"].get(part.name, {}).get("key") == key:
                 say(f"{part.name}: measured before")
@@ -206,13 +211,10 @@ def run_analysis(
                 say(f"{part.name}: {finding}")
         shown = [one for one in analysis.parts if one.name in content["parts"]]
         page = render(
-            "lab/analysis/templates/analysis.html",
-            title=f"{run_dir.name} · {analysis.method}",
-            paper=analysis.paper,
-            version=mien.__version__,
-            command=shlex.join(["mien", *sys.argv[1:]]),
+            "lab/analysis/templates/analysis.html", title=f"{run_dir.name} · {analysis.method}", paper=analysis.paper,
+            version=mien.__version__, command=shlex.join(["mien", *sys.argv[1:]]),
             sections=[section_html(one.title, content["parts"][one.name], folder) for one in shown],
-        )
+        )  # fmt: skip
         write_json(record, _FORMAT, _VERSION, content)
         write_atomically(folder / "analysis.html", lambda aside: aside.write_text(page, encoding="utf-8"))
     return content
