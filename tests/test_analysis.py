@@ -23,7 +23,7 @@ from mien.cli import main
 from mien.disk.files import write_tensors
 from mien.face import FaceModel
 from mien.lab.analysis import gaussian_avatars, measuring
-from mien.lab.analysis.gaussian_avatars import binned, jaw_opening, open_jaw, without_teeth
+from mien.lab.analysis.gaussian_avatars import jaw_opening, open_jaw, without_teeth
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.result import Chart, Result, Table
 from mien.machine import devices
@@ -167,8 +167,6 @@ def test_parts_train_and_draw_on_a_device(workspace: Path, elsewhere: set[str], 
 
 def test_growth_of_known_curves(workspace: Path) -> None:
     """Steps of 10 ms with 1,000 Gaussians and of 30 ms with 8,000 are a growth of 3 times and 8 times."""
-    x, y = binned(np.linspace(1000, 8000, 100), np.linspace(10, 30, 100))
-    assert (len(x), x[0] < 1400, y[-1] > 29) == (12, True, True)
     path = workspace / "runs/toy/curves.safetensors"
     curves = read_curves(workspace / "runs/toy")
     changed = {name: torch.full((40,), 0.5, dtype=torch.float64) for name in curves}

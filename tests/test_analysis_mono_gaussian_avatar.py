@@ -74,10 +74,10 @@ def test_short_trainings_write_their_pictures(workspace: Path, monkeypatch: pyte
     assert subsets[0]["head_psnr"] == sides[0]["head_psnr"], "all frames at full size is the same training in both"
     assert analyze(workspace, *asked) == parts
     # A capture with more pixels than the paper's is trained at the paper's two sizes.
-    monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {8: 0.004, 16: 0.00625})
+    monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {16: 0.004, 24: 0.00625})
     shutil.rmtree(workspace / "analysis")
     sides = analyze(workspace, "--parts", "resolutions", "--steps", "2")["resolutions"]["values"]["rows"]
-    assert [(row["side"], row["scale_gain"]) for row in sides] == [(16, 0.00625), (8, 0.004)]
+    assert [(row["side"], row["scale_gain"]) for row in sides] == [(24, 0.00625), (16, 0.004)]
 
 
 @pytest.mark.slow

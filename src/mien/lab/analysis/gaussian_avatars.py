@@ -119,38 +119,16 @@ def _growth_charts(steps: np.ndarray, gaussians: np.ndarray, times: np.ndarray, 
         np.array([steps[part].mean() for part in windows]),
         np.array([np.median(times[part]) for part in windows]),
     )
-    x, y = binned(gaussians, times)
-    start = max(float(gaussians[0]), 1)
-    line = np.array([1.0, max(10.0, float(gaussians.max()) / start)])
-    relative = [
-        Series("this run", x / start, y / max(few, 1e-9)),
-        Series("paper: at most", np.array([1.0, 10.0]), np.array([1.0, 2.0]), "second"),
-        Series("in proportion", line, line, "quiet"),
-    ]
+    most = Series("paper: at most", ends, np.full(2, 2 * few), "second")
     return [
         Chart("growth-gaussians", "Fig. 3a: number of Gaussians", number, Axes("step", "Gaussians", from_zero=True)),
         Chart(
             "growth-step-time",
             "Fig. 3b: time of a step, ms",
-            [Series("single steps", steps, single, "quiet"), middle],
+            [Series("single steps", steps, single, "quiet"), middle, most],
             Axes("step", "ms", from_zero=True),
         ),
-        Chart(
-            "growth-ratio",
-            "Step time over the number of Gaussians, both relative to the start",
-            relative,
-            Axes("Gaussians, times", "step time, times", from_zero=True),
-            "The lower, the better: on the quiet line, a step takes as many times longer as there are more Gaussians.",
-        ),
     ]
-
-
-def binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The medians of x and y in 12 bins of x."""
-    edges = np.linspace(x.min(), x.max(), 13)
-    bins = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, 11)
-    filled = [bins == index for index in np.unique(bins)]
-    return np.array([np.median(x[here]) for here in filled]), np.array([np.median(y[here]) for here in filled])
 
 
 def speed(context: Context) -> Result:
@@ -421,7 +399,6 @@ def scale(context: Context) -> Result:
         },
         findings,
         [Table(heading, rows)],
-        _scale_charts(runs),
         notes=[
             "With a threshold of 0, the loss shrinks every Gaussian. The supplement expects that more of them are then "
             "blended before a ray ends. Both trainings have the same settings, seed and frames.",
@@ -446,23 +423,3 @@ def _score(run: Run) -> float | None:
     if run.experiment is None:
         return None
     return round(mean_psnr(run.experiment, spread_frames(run.experiment.held_out_frames, 16)), 2)
-
-
-def _scale_charts(runs: dict[str, Run]) -> list[Chart]:
-    charts = []
-    for curve, title in (("step_ms", "Time of a step, ms"), ("gaussians", "Number of Gaussians")):
-        series = []
-        for (name, run), style in zip(runs.items(), ("main", "second"), strict=True):
-            values = run.curves[curve]
-            if curve == "step_ms":
-                values = _smooth(np.minimum(values, np.percentile(values, 98)))
-            series.append(Series(name, run.curves["step"], values, style))
-        name = f"scale-{curve.replace('_', '-')}"
-        charts.append(Chart(name, title, series, Axes("step", title, from_zero=True)))
-    return charts
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """The running median over a twentieth of the curve."""
-    reach = max(1, len(values) // 40)
-    return np.array([np.median(values[max(0, i - reach) : i + reach + 1]) for i in range(len(values))])
