@@ -23,7 +23,7 @@ from mien.capture import write_capture
 from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.datasets import overlay, pictures, sequences
-from mien.datasets.layouts.filmed import Filmed, filmed_frames
+from mien.datasets.layouts.filmed import Filmed, filmed_frames, vectors
 from mien.datasets.layouts.layout import find_layout
 from mien.datasets.layouts.writing import write_layout
 from mien.datasets.pictures import read_picture
@@ -181,8 +181,10 @@ def check_vectors(sequence: Any, timesteps: tuple[int, ...], single: Sequence, s
 
 def check_numbers(numbers: np.ndarray, timesteps: tuple[int, ...], single: Sequence, scene: Scene) -> None:
     moved = [each for each in scene.model.free_joint_names if each != "neck"]
-    expressions = min(single.tracking.face.expression.shape[1], numbers.shape[1] - 3 * len(moved))
-    assert np.allclose(numbers[:, :expressions], scene.expr[list(timesteps), :expressions], atol=1e-6)
+    whole = scene.expr[:, : single.tracking.face.expression.shape[1]]
+    kept = np.sort(np.argsort(-whole.std(0))[: numbers.shape[1] - 3 * len(moved)])
+    expressions = len(kept)
+    assert np.allclose(numbers[:, :expressions], whole[list(timesteps)][:, kept], atol=1e-6)
     joint = slice(expressions + 3 * moved.index("jaw"), expressions + 3 * moved.index("jaw") + 3)
     assert np.allclose(numbers[:, joint], scene.pose[list(timesteps), 2], atol=1e-6)
 
@@ -251,6 +253,17 @@ def test_avatar_mav_is_read_back(folders: dict[str, Path], single: Sequence, sce
                 seen = projected(world, mav, np.diag([1.0, -1, -1]), np.array([0, 0, 4.0]))
                 true, _ = one.project(scene.model(single.tracking.face[timestep])[0])
                 assert np.abs(seen - true.double().numpy()).max() < most
+
+
+def test_without_room_for_all_the_expressions_that_change_most_are_written(single: Sequence, scene: Scene) -> None:
+    expression = single.tracking.face.expression.clone()
+    expression[:, 1], expression[:, -1] = 0.5, torch.arange(TIMESTEPS) * 9.0
+    face = replace(single.tracking.face, expression=expression)
+    content = filmed(replace(single, tracking=replace(single.tracking, face=face)), scene)
+    joints = 3 * len([each for each in scene.model.free_joint_names if each != "neck"])
+    numbers, told = vectors(content, joints + 1)
+    assert np.array_equal(numbers[:, 0], expression[:, -1].double().numpy())
+    assert any(f"the {expression.shape[1] - 1} expression coefficients that change least" in words for words in told)
 
 
 _MAV = {"pose": (1, 6), "scale": (1,), "exp_coeff": (1, 32)}

@@ -46,8 +46,8 @@ def write(folder: Path, filmed: Filmed) -> Written:
         (
             "In its settings, dataroot is this folder and video_name is train; test is held out.",
             f"A head's own unit is {unit:.9g} m, and its origin at {', '.join(f'{each:.9g}' for each in origin)} m.",
-            f"Lost: perspective, because the program's camera is far away. The mesh is seen up to {error:.1f} pixels "
-            "beside its place. Also lost: the last digits of pixels and mattes, because the program reads .jpg.",
+            "Lost: perspective, because the program's camera is far away. The front of the mesh is seen up to "
+            f"{error:.1f} pixels beside its place. Also lost: the last digits of pixels and mattes, in .jpg.",
             *told,
         ),
     )
@@ -66,8 +66,9 @@ def _seen_from_afar(
 ) -> tuple[Float[np.ndarray, "t 6"], Float[np.ndarray, " t"], float]:
     """Poses and scales with which heads look as they were filmed, and the largest error of the mesh in pixels.
 
-    The box's middle has its place and its size in the picture, and is seen from the same side. A pose is an axis-angle
-    and a translation: a head's point p is at scale * R p + t in the world.
+    The box's middle has its place in the picture and is seen from the same side; the half of the mesh that is nearer
+    has its size, and the error is that of this half. A pose is an axis-angle and a translation: a head's point p is at
+    scale * R p + t in the world.
     """
     K, side, heads = filmed.K, filmed.size[0], filmed.head_to_camera()
     middle = origin + unit * (_LOW + _HIGH) / 2
@@ -75,19 +76,20 @@ def _seen_from_afar(
     pixels = before @ K.T
     after = np.ones_like(before)
     after[:, :2] = (pixels[:, :2] / pixels[:, 2:] / side - 0.5) / _FOCAL
-    scales = unit * (K[0, 0] + K[1, 1]) / 2 / before[:, 2] * _DISTANCE / (_FOCAL * side)
     turns = _turn_between(before, after) @ heads[:, :3, :3]
-    # From the middle of the box to the origin of the program's frame.
-    shifts = _DISTANCE * after - scales[:, None] * (turns @ ((middle - origin) / unit))
-    mesh = filmed.face_model(filmed.face_model.neutral(1))[0].double().numpy()
-    errors = []
-    for head, turn, shift, scale in zip(heads, turns, shifts, scales, strict=True):
+    mesh, scales, shifts, errors = filmed.face_model.template.double().numpy(), [], [], []
+    for head, turn, place, ahead in zip(heads, turns, before, after, strict=True):
         true = (mesh @ head[:3, :3].T + head[:3, 3]) @ K.T
-        seen = scale * ((mesh - origin) / unit) @ turn.T + shift
+        near = true[:, 2] < place[2]
+        depth = true[near, 2].mean()
+        scales.append(unit * (K[0, 0] + K[1, 1]) / 2 / depth * _DISTANCE / (_FOCAL * side))
+        # From the middle of the box to the origin of the program's frame.
+        shifts.append(_DISTANCE * place[2] / depth * ahead - scales[-1] * (turn @ ((middle - origin) / unit)))
+        seen = scales[-1] * ((mesh - origin) / unit) @ turn.T + shifts[-1]
         drawn = side * (_FOCAL * seen[:, :2] / seen[:, 2:] + 0.5)
-        errors.append(np.linalg.norm(drawn - true[:, :2] / true[:, 2:], axis=1).max())
-    world = np.concatenate([axis_angles(AXES @ turns), (shifts - [0, 0, _DISTANCE]) @ AXES], axis=1)
-    return world, scales, float(max(errors))
+        errors.append(np.linalg.norm(drawn - true[:, :2] / true[:, 2:], axis=1)[near].max())
+    world = np.concatenate([axis_angles(AXES @ turns), (np.array(shifts) - [0, 0, _DISTANCE]) @ AXES], axis=1)
+    return world, np.array(scales), float(max(errors))
 
 
 def _turn_between(first: Float[np.ndarray, "t 3"], second: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3 3"]:

@@ -49,8 +49,8 @@ def write(folder: Path, filmed: Filmed) -> Written:
             f"The first {len(filmed.trained)} pictures are trained on: run its training with --test_start "
             f"{len(filmed.trained)}. Without it, the program holds out the last 500.",
             "head_imgs are over white, as bc.jpg is. The world has the head at rest; its unit is the metre.",
-            f"Lost: soft edges of mattes, and the last digits of pixels, because the program reads .jpg. {without} "
-            "pictures have no .lms, because no face was detected in them; the program reads one of each.",
+            "Lost: soft edges of mattes, and the last digits of pixels, because the program reads .jpg.",
+            *[f"Not written: .lms of {without} pictures without landmarks, which the program needs."][: without > 0],
             *told,
         ),
     )
