@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -129,6 +130,37 @@ def _holder() -> "Iterator[Holder]":
     holder = Holder()
     yield holder
     holder.kill()
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Let analyses train and draw in float64 in place of a GPU, and return the dtypes of what is drawn by the clock."""
+    from mien.avatar.avatar import move_avatar
+    from mien.lab.analysis import measuring, mono_gaussian_avatar, running
+    from mien.training import run, trainer
+
+    drawn, rasterize, write_avatar, write_tensors = set[str](), measuring.rasterize, run.write_avatar, run.write_tensors
+
+    def draw(gaussians, *more):
+        drawn.add(str(gaussians.means.dtype).removeprefix("torch."))
+        return rasterize(gaussians, *more)
+
+    for module in (measuring, mono_gaussian_avatar):
+        monkeypatch.setattr(module, "rasterize", draw)
+
+    # Files have float32, as those of a GPU.
+    def write(folder, avatar):
+        move_avatar(copied := deepcopy(avatar), torch.zeros(()))
+        write_avatar(folder, copied)
+
+    def write_short(path, tensors):
+        write_tensors(path, {name: one.float() if one.is_floating_point() else one for name, one in tensors.items()})
+
+    monkeypatch.setattr(run, "write_avatar", write)
+    monkeypatch.setattr(run, "write_tensors", write_short)
+    for module in (running, trainer):
+        monkeypatch.setattr(module, "like_on", lambda _: torch.zeros((), dtype=torch.float64))
+    return drawn
 
 
 other = pytest.fixture(scope="module")(_holder)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -19,13 +20,15 @@ from mien.cli import main
 from mien.gaussians import Gaussians
 from mien.lab.analysis import headgas
 from mien.lab.analysis.headgas import Trained, busy_face, start_of_bases, trained_range, with_expression
+from mien.lab.analysis.joining import joined_rows
 from mien.lab.analysis.measuring import head_camera, mouth_camera
 from mien.lab.analysis.registry import AnalysisOptions
 from mien.lab.analysis.running import Context
 from mien.media.video import count_frames
 from mien.runtime.filmed import head_angles
+from mien.training.run import read_face_track
 from shared_things import MadeOnce, write_toy_workspace
-from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
 
 pytestmark = pytest.mark.unchecked
 _GROWTH = GradientSettings(start=0.2, stop=0.8, rounds=3, grow_gradient=1e-4, opacity_resets=(), max_gaussians=150)
@@ -52,7 +55,7 @@ workspace = pytest.fixture(lambda toy, tmp_path: Path(shutil.copytree(toy, tmp_p
 
 @pytest.fixture
 def context(toy: Path, tmp_path: Path) -> Context:
-    return Context(toy / "runs/toy", (toy / "sequences/clip",), tmp_path, AnalysisOptions())
+    return Context(toy / "runs/toy", (toy / "sequences/clip",), torch.zeros(()), tmp_path, AnalysisOptions())
 
 
 def analyze(root: Path, *more: str) -> dict[str, Any]:
@@ -81,6 +84,24 @@ def test_parts_without_training_write_pictures_and_films(workspace: Path) -> Non
     assert {name: after[name] for name in before} == before
 
 
+def test_several_subjects_are_joined_to_statistics(toy: Path, tmp_path: Path, capsys) -> None:
+    folders = [str(shutil.copytree(toy, tmp_path / name)) for name in ("anna", "ben", "carl")]
+    asked = ["--parts", "sizes", "layers", "--seconds", "0.01", "--out", str(tmp_path / "out")]
+    assert main(["analyze", *folders, *asked, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["subjects"] == ["anna", "ben", "carl"]
+    assert list(found["parts"]) == ["sizes"], "layers have no figures to join"
+    records = [json.loads((tmp_path / "out" / name / "analysis.json").read_text()) for name in found["subjects"]]
+    rows = {(row["row"], row["figure"]): row for row in found["parts"]["sizes"]}
+    for index, size in enumerate(("16x16", "32x32")):
+        own = [record["parts"]["sizes"]["values"]["rows"][index]["frame_ms"] for record in records]
+        wanted = {"subjects": 3, "mean": pytest.approx(sum(own) / 3), "least": min(own), "largest": max(own)}
+        assert rows[size, "frame_ms"] == {"row": size, "figure": "frame_ms", **wanted}
+    assert "| 32x32 | Paper: frame, ms | 3 | 8 | 8 | 8 |" in (tmp_path / "out/joined.md").read_text()
+    several = [{"values": {"rows": [{"name": "full", "head_psnr": psnr}]}} for psnr in (30.0, None, 31.0)]
+    assert [(row["subjects"], row["mean"]) for row in joined_rows(several)] == [(2, 30.5)]
+
+
 def test_the_ablations_are_trained_and_timed_alike(
     workspace: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,6 +121,13 @@ def test_the_ablations_are_trained_and_timed_alike(
     assert (workspace / "analysis/toy/ablations.png").is_file()
     assert analyze(workspace, *asked)["ablations"] == part
     assert list(analyze(workspace, *asked, "--widen")["ablations"]["values"]["widths"])[:2] == ["8", "16"]
+
+
+def test_ablations_and_sizes_on_a_device(workspace: Path, elsewhere: set[str]) -> None:
+    asked = ("--parts", "sizes", "ablations", "--steps", "2", "--seconds", "0.01", "--device", "auto")
+    rows = analyze(workspace, *asked)["ablations"]["values"]["rows"]
+    assert all(row["frame_ms"] > 0 and row["head_psnr"] > 0 for row in rows)
+    assert "float64" in elsewhere
 
 
 def test_rows_differ_only_in_what_they_say() -> None:
@@ -137,6 +165,27 @@ def test_gaussians_are_removed_from_near_to_far() -> None:
     assert order.tolist() == [1, 0, 5]
     assert headgas.without_nearest(6, order, 0.0).all()
     assert headgas.without_nearest(6, order, 0.67).tolist() == [False, False, True, True, True, True]
+
+
+def test_the_mouth_is_that_of_a_frontal_frame_with_shut_lips(context: Context, monkeypatch) -> None:
+    _, sequence = toy_sequence(20, 32)
+    marks, turns = np.zeros((20, 1, 478, 2), np.float32), torch.zeros(20, 3)
+    marks[:, 0, 263, 0], marks[:, 0, 14, 1], turns[3, 1] = 10.0, 4.0, 0.5
+    assert headgas.shut_lips([replace(sequence, capture=replace(sequence.capture, landmarks=0 * marks))]) is None
+    marks[[3, 7], 0, 14, 1], marks[9, 0, 13:15], marks[11, 0, 263] = 0.1, np.nan, 0.0
+    face = replace(sequence.tracking.face, head_rotation=turns)
+    changed = replace(sequence.tracking, face=face)
+    found = replace(sequence, capture=replace(sequence.capture, landmarks=marks), tracking=changed)
+    assert headgas.shut_lips([sequence, found]) == (1, 7), "of 3 and 7, it is the one that is not turned"
+    (own,) = context.sequences
+    vars(context)["sequences"] = [replace(own, capture=replace(own.capture, landmarks=marks[5:10]))]
+    drawn, draw = [], headgas.draw_avatar
+    monkeypatch.setattr(headgas, "draw_avatar", lambda *given: drawn.append(given[1]) or draw(*given))
+    picture = headgas.layers(context).pictures[1]
+    assert "The mouth in clip, timestep 2, whose lips are shut" in picture.caption
+    wanted = read_face_track(context.run_dir, context.avatar.face_model)[2]
+    assert torch.equal(drawn[-1].expression, wanted.expression)
+    assert picture.image.shape[1] == 8 * 32 + 7 * 4, "the picture as it was filmed, then seven shares"
 
 
 def test_bases_with_negative_coefficients_start_at_the_person_at_rest() -> None:

@@ -58,7 +58,7 @@ def test_short_trainings_write_their_pictures(workspace: Path, monkeypatch: pyte
     monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {16: 0.004, 32: 0.00625})
     asked = ("--parts", "convergence", "resolutions", "diversity", "--steps", "10")
     parts = analyze(workspace, *asked)
-    assert "diversity: 3 trainings of 10 steps each" in capsys.readouterr().err
+    assert "diversity: 5 trainings of 10 steps each" in capsys.readouterr().err
     files = ("convergence.png", "convergence-psnr.svg", "convergence-points.svg", "resolutions.png", "diversity.png")
     assert all((workspace / "analysis/toy" / name).is_file() for name in files)
     shown, sides, subsets = (parts[name]["values"]["rows"] for name in ("convergence", "resolutions", "diversity"))
@@ -67,11 +67,17 @@ def test_short_trainings_write_their_pictures(workspace: Path, monkeypatch: pyte
     runs = (workspace / "analysis/toy/runs").glob("resolution-*")
     gains = {one.name.split("-")[1]: load_avatar(one).config.scale_gain for one in runs}  # type: ignore[attr-defined]
     assert gains == {"16": 0.004, "32": 0.00625}
-    wanted = [("all frames", 4), ("frontal quarter", 1), ("mixed half", 2)]
+    clips = [("frontal clip", 1), ("mixed clip", 2)]
+    wanted = [("all frames", 4), *clips, ("frontal quarter", 1), ("mixed half", 2)]
     assert [(row["name"], row["timesteps"]) for row in subsets] == wanted
-    assert [len({row["head_psnr"] for row in rows}) for rows in (shown, sides, subsets)] == [4, 2, 3]
+    assert [len({row["head_psnr"] for row in rows}) for rows in (shown, sides)] == [4, 2]
     assert subsets[0]["head_psnr"] == sides[0]["head_psnr"], "all frames at full size is the same training in both"
     assert analyze(workspace, *asked) == parts
+    # A capture with more pixels than the paper's is trained at the paper's two sizes.
+    monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {16: 0.004, 24: 0.00625})
+    shutil.rmtree(workspace / "analysis")
+    sides = analyze(workspace, "--parts", "resolutions", "--steps", "2")["resolutions"]["values"]["rows"]
+    assert [(row["side"], row["scale_gain"]) for row in sides] == [(24, 0.00625), (16, 0.004)]
 
 
 @pytest.mark.slow
@@ -91,6 +97,14 @@ def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.M
     assert trained.keys() == seen[-1].keys()
     for name, tensor in trained.items():
         assert torch.equal(tensor, seen[-1][name]), name
+
+
+def test_times_and_stages_on_a_device(workspace: Path, elsewhere: set[str]) -> None:
+    parts = analyze(
+        workspace, "--parts", "times", "convergence", "--steps", "2", "--seconds", "0.01", "--device", "auto"
+    )
+    assert parts["convergence"]["values"]["rows"][-1]["head_psnr"] > 0
+    assert "float64" in elsewhere
 
 
 def measured(angles: np.ndarray, expressions: np.ndarray) -> analysis.Measured:
@@ -118,4 +132,9 @@ def test_the_mixed_half_keeps_what_is_rare() -> None:
 
 def test_the_frontal_quarter_has_the_views_nearest_to_the_median():
     yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
-    assert analysis.frontal_quarter(measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))) == [3, 7]
+    whole = measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))
+    assert analysis.frontal_quarter(whole) == [3, 7]
+    # Clips are successive timesteps, whatever lies between the best ones.
+    assert analysis.clip(whole, 0.25, mixed=False) == [3, 4]
+    assert analysis.clip(whole, 0.5, mixed=True) == [0, 1, 2, 3]
+    assert analysis.clip(whole, 0.25, mixed=True) == [5, 6]

@@ -24,7 +24,7 @@ from mien.cli import main
 from mien.commands import render
 from mien.face import FaceModel
 from mien.gaussians import Gaussians, Rendering
-from mien.machine.devices import choose_device, like_on
+from mien.machine.devices import choose_device, gpu_memory_mb, like_on
 from mien.training import TrainSettings, batch, train, trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.frames import FrameOrder, training_frames
@@ -100,6 +100,15 @@ def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "some GPU")
     assert choose_device("auto").type == choose_device("cuda").type == "cuda"
     assert "some GPU: gsplat compiles its kernels at first use" in capsys.readouterr().err
+
+
+def test_memory_of_a_gpu_is_what_its_tensors_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    restarted: list[torch.device] = []
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 << 30)
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", restarted.append)
+    gpu = torch.device("cuda")
+    assert (gpu_memory_mb(gpu), gpu_memory_mb(torch.device("cpu")), restarted) == (3072, 0, [])
+    assert (gpu_memory_mb(gpu, restart=True), restarted) == (3072, [gpu])
 
 
 @pytest.mark.unchecked

@@ -23,7 +23,7 @@ from mien.capture import write_capture
 from mien.capture.store import read_capture_hash
 from mien.cli import main
 from mien.datasets import overlay, pictures, sequences
-from mien.datasets.layouts.filmed import Filmed, filmed_frames
+from mien.datasets.layouts.filmed import Filmed, filmed_frames, vectors
 from mien.datasets.layouts.layout import find_layout
 from mien.datasets.layouts.writing import write_layout
 from mien.datasets.pictures import read_picture
@@ -51,6 +51,7 @@ TRAINED = tuple(t for t in ALL if t not in HELD_OUT)
 CAMERAS = ("222200037", "222200036")
 LAYOUTS = {
     "insta": ["00008", "00009"], "imavatar": ["1", "2"], "nerface": ["f_0000", "f_0001"],
+    "nerf-blendshape": ["10", "11"], "avatar-mav": ["img_00000", "img_00001"],
     "nersemble": [f"clip-test_cam_{CAMERAS[0]}_0000{n}" for n in range(2)],
 }  # fmt: skip
 """Layouts, with the names of their held-out pictures."""
@@ -165,6 +166,29 @@ def check_halves(train: Any, test: Any, single: Sequence, scene: Scene) -> None:
     assert not train.own_split.timesteps
 
 
+def check_vectors(sequence: Any, timesteps: tuple[int, ...], single: Sequence, scene: Scene, unit: float) -> None:
+    """Check intrinsics, the head's poses in metres, and the numbers in place of expressions."""
+    check_intrinsics(filmed_camera(sequence), UNEQUAL)
+    for row, timestep in enumerate(timesteps):
+        matrix = sequence.foreign["head_to_camera"][row]
+        face, (rotation, translation) = single.tracking.face[timestep], view(0)
+        turn = rotation @ rotation_of(face.head_rotation[0].double().numpy())
+        shift = rotation @ face.head_translation[0].double().numpy() + translation
+        np.testing.assert_allclose(matrix[:3, :3], turn, rtol=0, atol=CAMERA)
+        np.testing.assert_allclose(matrix[:3, 3] * unit, shift, rtol=0, atol=CAMERA)
+    check_numbers(sequence.foreign["expression"], timesteps, single, scene)
+
+
+def check_numbers(numbers: np.ndarray, timesteps: tuple[int, ...], single: Sequence, scene: Scene) -> None:
+    moved = [each for each in scene.model.free_joint_names if each != "neck"]
+    whole = scene.expr[:, : single.tracking.face.expression.shape[1]]
+    kept = np.sort(np.argsort(-whole.std(0))[: numbers.shape[1] - 3 * len(moved)])
+    expressions = len(kept)
+    assert np.allclose(numbers[:, :expressions], whole[list(timesteps)][:, kept], atol=1e-6)
+    joint = slice(expressions + 3 * moved.index("jaw"), expressions + 3 * moved.index("jaw") + 3)
+    assert np.allclose(numbers[:, joint], scene.pose[list(timesteps), 2], atol=1e-6)
+
+
 def test_nerface_is_read_back(folders: dict[str, Path], single: Sequence, scene: Scene) -> None:
     train, test = read(folders["nerface"], "nerface", scene.model)
     fx, fy, *_ = json.loads((folders["nerface"] / "transforms_test.json").read_text())["intrinsics"]
@@ -174,21 +198,75 @@ def test_nerface_is_read_back(folders: dict[str, Path], single: Sequence, scene:
         over_white = np.stack([filmed(single, scene).over_white(timestep) for timestep in timesteps])
         assert np.array_equal(sequence.capture.images[:, 0], over_white)
         assert (over_white[:, :5] == 255).all(), "no filmed background is left"
-        check_intrinsics(filmed_camera(sequence), UNEQUAL)
-        for row, timestep in enumerate(timesteps):
-            matrix = sequence.foreign["head_to_camera"][row]
-            face, (rotation, translation) = single.tracking.face[timestep], view(0)
-            turn = rotation @ rotation_of(face.head_rotation[0].double().numpy())
-            shift = rotation @ face.head_translation[0].double().numpy() + translation
-            np.testing.assert_allclose(matrix[:3, :3], turn, rtol=0, atol=CAMERA)
-            np.testing.assert_allclose(matrix[:3, 3] * float(unit[1]), shift, rtol=0, atol=CAMERA)
-        foreign = sequence.foreign["expression"]
-        expressions = single.tracking.face.expression.shape[1]
-        assert np.allclose(foreign[:, :expressions], scene.expr[list(timesteps), :expressions], atol=1e-6)
-        jaw = 3 * [each for each in scene.model.free_joint_names if each != "neck"].index("jaw")
-        joint = slice(expressions + jaw, expressions + jaw + 3)
-        assert np.allclose(foreign[:, joint], scene.pose[list(timesteps), 2], atol=1e-6)
+        check_vectors(sequence, timesteps, single, scene, float(unit[1]))
     assert test.own_split.whole(len(HELD_OUT))
+
+
+def near(folder: Path, name: str, picture: np.ndarray) -> bool:
+    """Whether a file holds a picture, but for the loss of a .jpg."""
+    return np.abs(read_picture(folder / name)[0].astype(int) - picture).mean() < 1
+
+
+def test_nerf_blendshape_is_read_back(folders: dict[str, Path], single: Sequence, scene: Scene) -> None:
+    """What is held out comes last; a picture has its head, its parsing and its landmarks by its number."""
+    folder, order, content = folders["nerf-blendshape"], (*TRAINED, *HELD_OUT), filmed(single, scene)
+    (sequence,) = read(folder, "nerf-blendshape", scene.model)
+    for number, timestep in enumerate(order):
+        assert near(folder, f"ori_imgs/{number}.jpg", content.image(timestep))
+        assert near(folder, f"head_imgs/{number}.jpg", content.over_white(timestep))
+        assert np.array_equal(sequence.capture.mattes[number, 0], (content.matte(timestep) > 127) * np.uint8(255))
+        marks = single.capture.landmarks[timestep, 0]
+        assert np.allclose(sequence.capture.landmarks[number, 0], marks, atol=1e-3)
+    check_vectors(sequence, order, single, scene, 1.0)
+    own = np.array([frame["exp_ori"] for frame in json.loads((folder / "transforms.json").read_text())["frames"]])
+    assert np.allclose(np.loadtxt(folder / "max_46.txt"), own[: len(TRAINED)].max(0)), "held-out frames do not count"
+    assert np.allclose(np.loadtxt(folder / "min_46.txt"), own[: len(TRAINED)].min(0))
+    assert near(folder, "bc.jpg", np.full((SIDE, SIDE, 3), 255))
+    assert "--test_start 10." in (folder / "README.txt").read_text()
+
+
+def test_avatar_mav_is_read_back(folders: dict[str, Path], single: Sequence, scene: Scene, tmp_path: Path) -> None:
+    """By the formulas of its camera: heads look as they were filmed. Filmed by a camera as far away, exactly."""
+    camera, content, focal = single.tracking.cameras[0], filmed(single, scene), 2500 / 256 * SIDE
+    mav = np.array([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1]])
+    viewmat = camera.viewmat.clone()
+    viewmat[2, 3] *= focal / camera.K[0, 0]
+    afar = replace(camera, K=torch.from_numpy(mav).float(), viewmat=viewmat)
+    far = filmed(replace(single, tracking=replace(single.tracking, cameras=(afar,))), scene)
+    far_folder = export(tmp_path / "far", "avatar-mav", far)
+    for folder, one, most in ((folders["avatar-mav"], camera, 3.0), (far_folder, afar, 0.01)):
+        told = (folder / "README.txt").read_text()
+        unit, *origin = map(float, known(re.search(r"unit is (\S+) m, .* at (\S+), (\S+), (\S+) m", told)).groups())
+        for part, timesteps in (("train", TRAINED), ("test", HELD_OUT)):
+            assert len(list((folder / part / "images").iterdir())) == 2 * len(timesteps)
+            for number, timestep in enumerate(timesteps):
+                assert near(folder, f"{part}/images/img_{number:05d}.jpg", content.image(timestep))
+                mask = np.repeat(content.matte(timestep)[..., None], 3, axis=2)
+                assert near(folder, f"{part}/images/mask_{number:05d}.jpg", mask)
+                found = np.load(folder / part / f"params/params_{number:05d}.npz")
+                shapes = {name: (found[name].shape, found[name].dtype.name) for name in found.files}
+                assert shapes == {name: (shape, "float32") for name, shape in _MAV.items()}
+                check_numbers(found["exp_coeff"], (timestep,), single, scene)
+                head = scene.model.head_vertices(single.tracking.face[timestep])[0].double().numpy()
+                pose = found["pose"][0].astype(float)
+                world = found["scale"] * ((head - origin) / unit) @ rotation_of(pose[:3]).T + pose[3:]
+                seen = projected(world, mav, np.diag([1.0, -1, -1]), np.array([0, 0, 4.0]))
+                true, _ = one.project(scene.model(single.tracking.face[timestep])[0])
+                assert np.abs(seen - true.double().numpy()).max() < most
+
+
+def test_without_room_for_all_the_expressions_that_change_most_are_written(single: Sequence, scene: Scene) -> None:
+    expression = single.tracking.face.expression.clone()
+    expression[:, 1], expression[:, -1] = 0.5, torch.arange(TIMESTEPS) * 9.0
+    face = replace(single.tracking.face, expression=expression)
+    content = filmed(replace(single, tracking=replace(single.tracking, face=face)), scene)
+    joints = 3 * len([each for each in scene.model.free_joint_names if each != "neck"])
+    numbers, told = vectors(content, joints + 1)
+    assert np.array_equal(numbers[:, 0], expression[:, -1].double().numpy())
+    assert any(f"the {expression.shape[1] - 1} expression coefficients that change least" in words for words in told)
+
+
+_MAV = {"pose": (1, 6), "scale": (1,), "exp_coeff": (1, 32)}
 
 
 def test_nersemble_is_read_back(folders, single: Sequence, both: Sequence, scene: Scene, tmp_path: Path) -> None:
@@ -239,9 +317,13 @@ def test_frames_that_mien_does_not_train_on_are_left_out(single: Sequence, scene
 def test_what_a_layout_cannot_hold_is_told_or_refused(
     both: Sequence, single: Sequence, scene: Scene, anny: FaceModel, tmp_path: Path
 ) -> None:
-    for name in ("insta", "imavatar", "nerface"):
+    for name in ("insta", "imavatar", "nerface", "nerf-blendshape", "avatar-mav"):
         with pytest.raises(UserError, match=f"clip: has 2 cameras, and the layout {name} holds one"):
             export(tmp_path / name, name, filmed(both, scene))
+    images, mattes = (each[:, :, :, :99] for each in (single.capture.images, single.capture.mattes))
+    narrow = replace(single, capture=replace(single.capture, images=images, mattes=mattes), scoring=mattes)
+    refuses("of 99x128, and the layout avatar-mav holds square ones", export, tmp_path / "narrow", "avatar-mav",
+            filmed(narrow, scene))  # fmt: skip
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").touch()
     refuses("full: is not empty", export, tmp_path / "full", "nersemble", filmed(both, scene))
@@ -277,7 +359,11 @@ def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch
         assert message in line
 
     refused("--benchmark is an option of --format nersemble-benchmark", "--format", "insta", "--benchmark", "393")
-    refused("choose insta, imavatar, nerface, nersemble or nersemble-benchmark", "--format", "inst")
+    refused(
+        "choose insta, imavatar, nerface, nerf-blendshape, avatar-mav, nersemble or nersemble-benchmark",
+        "--format",
+        "inst",
+    )
     refused("there is no run yet", "--format", "insta", "--run", "me")
     refused("no sequence 'other'", "--format", "insta", "--sequence", "other")
     refused("--split dataset: the sequence clip has no split", "--format", "insta", "--split", "dataset")

@@ -116,7 +116,7 @@ def test_an_analysis_goes_to_no_link(workspace: Path, victim: Path, capsys: pyte
     """A folder that the user names may be reached by a link, but nothing in it may be one."""
     command = ["analyze", "gaussian-avatars", str(workspace), "--parts", "growth"]
     own, other = workspace / "analysis/toy", workspace.parent / "out"
-    for place in (own / "runs", own / "growth-ratio.png", own, own.parent, other / "runs", other / "analysis.json"):
+    for place in (own / "runs", own / "growth-gaussians.svg", own, own.parent, other / "runs", other / "analysis.json"):
         put(place, victim / "notes" if "." in place.name else victim)
         assert main([*command, "--out", str(other)] if other in place.parents else command) == 2
         assert f"mien: {place}: is a link" in capsys.readouterr().err

@@ -109,14 +109,13 @@ def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
     tensors = read_tensors(path)
     before = 1e6 + float(tensors["seconds"])
     assert before - 1e6 > sum(tensors["curves.step_ms"].tolist()) / 1000 > 0
-    changed = {
-        name: torch.tensor(value, dtype=torch.float64) for name, value in (("seconds", before), ("peak_memory_mb", 7e6))
-    }
+    told = {"seconds": before, "peak_memory_mb": 7e6, "gpu_memory_mb": 5e3}
+    changed = {name: torch.tensor(value, dtype=torch.float64) for name, value in told.items()}
     write_tensors(path, tensors | changed, {"format": "mien.checkpoint", "version": "1"})
     train_toy.main(tmp_path, STEPS)
     summary, curves = read_training_summary(tmp_path), read_curves(tmp_path)
     assert round(before, 1) <= summary["seconds"] < 2e6, "counted on, not anew and not twice"
-    assert (summary["steps"], summary["peak_memory_mb"]) == (STEPS, 7e6)
+    assert (summary["steps"], summary["peak_memory_mb"], summary["gpu_memory_mb"]) == (STEPS, 7e6, 5e3)
     assert curves["step"].tolist() == list(range(3, STEPS + 1, 3))
     assert curves["step_ms"][:2].tolist() == tensors["curves.step_ms"].tolist()
 

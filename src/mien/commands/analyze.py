@@ -10,21 +10,25 @@ import tyro
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.lab.analysis.registry import ANALYSES, Analysis, AnalysisOptions, chosen_parts
+from mien.machine.devices import DeviceName, check_device
 
 
 def _about_target() -> str:
-    return f"Workspace folder. The method of its run ({', '.join(ANALYSES)}) may stand before it."
+    return (
+        f"Workspace folder, or several, whose figures are then also joined to statistics over subjects. The method of "
+        f"their runs ({', '.join(ANALYSES)}) may stand before them."
+    )
 
 
 @dataclass(frozen=True)
 class Command:
     """Measure on a run what the paper of its method measures, and show it beside the paper's figures.
 
-    Writes analysis.html (one page), analysis.json, a .svg for each chart and a .png for each picture. A stopped command
-    continues where it was, and what is measured is not measured again.
+    Writes analysis.html (one page), analysis.json, a .svg for each chart and a .png for each picture, and of several
+    workspaces joined.md and joined.json. A stopped command continues, and what is measured is not measured again.
     """
 
-    target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR"), _about_target]
+    target: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR [DIR ...]"), _about_target]
     run_name: Annotated[str | None, tyro.conf.arg(name="run")] = None
     """Name of the run (default: the only one)."""
     parts: tuple[str, ...] = ()
@@ -35,10 +39,13 @@ class Command:
     """Number of optimiser steps of each short training."""
     seconds: float = 2.0
     """Seconds to spend on each timed row."""
+    device: DeviceName = "cpu"
+    """Device of short trainings and of timed drawing. cuda takes the figures of a GPU."""
     widen: bool = False
     """Widen the ablation of HeadGaS without blending until its PSNR gains less than 0.1 dB."""
     out: Path | None = None
-    """Folder for the result and the short trainings (default: analysis/RUN in the workspace)."""
+    """Folder for the result and the short trainings (default: analysis/RUN in the workspace). Several workspaces have
+    folders of their names in it (default: joined.md is in analysis of the first)."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the content of analysis.json on standard output, for programs."""
 
@@ -47,45 +54,61 @@ class Command:
         from mien.disk.files import check_writable
         from mien.disk.reading import check_subtrees
 
-        AnalysisOptions(self.steps, self.seconds, self.widen).check()
-        workspace = self._workspace()
-        chosen_parts(self._analysis(workspace), self.parts, self.train)
-        check_subtrees(workspace.root, "analysis")
-        check_writable(self._folder(workspace, workspace.pick_run(self.run_name)), folder=True)
+        self._options().check()
+        check_device(self.device)
+        workspaces = self._workspaces()
+        chosen_parts(self._analysis(workspaces[0]), self.parts, self.train)
+        for workspace in workspaces:
+            check_subtrees(workspace.root, "analysis")
+            check_writable(self._folder(workspace, workspace.pick_run(self.run_name)), folder=True)
 
     def run(self) -> None:
         """Measure the parts and write the page."""
         import json
 
+        from mien.lab.analysis.joining import join_analyses
         from mien.lab.analysis.running import run_analysis
         from mien.machine.progress import say
         from mien.machine.terminal import show
         from mien.pipeline.evaluate import run_sequences
 
-        workspace = self._workspace()
-        run = workspace.pick_run(self.run_name)
-        run_dir, folder = workspace.run_dir(run), self._folder(workspace, run)
-        analysis = self._analysis(workspace)
-        parts = chosen_parts(analysis, self.parts, self.train)
-        options = AnalysisOptions(self.steps, self.seconds, self.widen)
-        content = run_analysis(analysis, parts, run_dir, run_sequences(workspace, run_dir), folder, options)
-        left = [part.name for part in analysis.parts if part.trains and part.name not in content["parts"]]
-        if left:
-            say(f"not measured, because they train: {', '.join(left)} (--train, or --parts)")
-        say(f"Look at {folder / 'analysis.html'}")
+        workspaces, contents = self._workspaces(), {}
+        analysis = self._analysis(workspaces[0])
+        parts, content = chosen_parts(analysis, self.parts, self.train), {}
+        for workspace in workspaces:
+            run_dir = workspace.run_dir(run := workspace.pick_run(self.run_name))
+            folder, sequences = self._folder(workspace, run), run_sequences(workspace, run_dir)
+            content = run_analysis(analysis, parts, run_dir, sequences, folder, self._options())
+            contents[workspace.root.resolve().name] = content
+            left = [part.name for part in analysis.parts if part.trains and part.name not in content["parts"]]
+            if left:
+                say(f"not measured, because they train: {', '.join(left)} (--train, or --parts)")
+            say(f"Look at {folder / 'analysis.html'}")
+        if len(workspaces) > 1:
+            folder = self.out or workspaces[0].root / "analysis"
+            content = join_analyses(analysis, contents, folder)
+            say(f"Look at {folder / 'joined.md'}")
         if self.as_json:
             show(json.dumps(content, indent=1))
 
-    def _workspace(self) -> Workspace:
-        if len(self.target) not in (1, 2):
-            raise UserError(f"analyze takes a workspace, and before it the method of its run, not {len(self.target)}")
-        if len(self.target) == 2 and self.target[0] not in ANALYSES:
+    def _options(self) -> AnalysisOptions:
+        return AnalysisOptions(self.steps, self.seconds, self.device, self.widen)
+
+    def _workspaces(self) -> list[Workspace]:
+        folders = self.target[self._is_named() :]
+        if 1 < len(self.target) == len(folders) and not Path(folders[0]).exists():
             raise UserError(f"{self.target[0]}: has no analysis; choose one of {', '.join(ANALYSES)}, or leave it out")
-        return open_workspace(Path(self.target[-1]))
+        workspaces = [open_workspace(Path(each)) for each in folders]
+        names = [each.root.resolve().name for each in workspaces]
+        if not names:
+            raise UserError("analyze takes a workspace, or several; give a folder")
+        if len({*names}) < len(names):
+            raise UserError(f"{max(names, key=names.count)}: two workspaces have this name; rename a folder")
+        return workspaces
 
     def _analysis(self, workspace: Workspace) -> Analysis:
-        """The analysis of the method that is named, or of the run's method."""
-        if len(self.target) == 2:
+        """The analysis of the method that is named, or of the first run's method."""
+        if self._is_named():
             return ANALYSES[self.target[0]]
         from mien.training.run import read_run_config
 
@@ -96,7 +119,14 @@ class Command:
         return ANALYSES[method]
 
     def _folder(self, workspace: Workspace, run: str) -> Path:
-        return self.out or workspace.root / "analysis" / run
+        if self.out is None:
+            return workspace.root / "analysis" / run
+        several = len(self.target) - self._is_named() > 1
+        return self.out / workspace.root.resolve().name if several else self.out
+
+    def _is_named(self) -> bool:
+        """Whether the method is named before the workspaces."""
+        return len(self.target) > 1 and self.target[0] in ANALYSES
 
 
 # The help names the parts of every analysis, which only the analyses know.

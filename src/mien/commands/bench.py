@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
+from mien.commands.evaluate import Protocol, check_weights, scoring_of
 from mien.commands.train_options import check_method, listed_methods
 from mien.disk.config import POSITIVE, Range
 from mien.disk.workspace import open_workspace
@@ -53,31 +54,6 @@ class Render(_Timed):
         on_gpu = device.type == "cuda"
         rows = gpu_rows(like_on(device), self.seconds) if on_gpu else render_suite(self.seconds)
         show_rows(rows, self.as_json, gpu=on_gpu)
-
-
-@dataclass(frozen=True)
-class Scaling(_Timed):
-    """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
-
-    plot: Path | None = None
-    """File for a chart, .svg (default: no chart)."""
-
-    def check(self) -> None:
-        """Check before any measurement that the chart can be written."""
-        from mien.disk.files import check_writable
-
-        if self.plot is not None:
-            if self.plot.suffix != ".svg":
-                raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
-            check_writable(self.plot)
-
-    def run(self) -> None:
-        """Measure and print the rows, then draw the chart."""
-        from mien.lab.benchmarking.render import scaling_suite, write_scaling_chart
-
-        rows = show_rows(scaling_suite(self.seconds), self.as_json)
-        if self.plot is not None:
-            write_scaling_chart(self.plot, rows)
 
 
 @dataclass(frozen=True)
@@ -167,9 +143,15 @@ class Compare:
     means --steps."""
     steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
-    split: Literal["blocks", "tail"] = "blocks"
-    """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
-    captures have their own."""
+    split: Literal["blocks", "tail", "dataset"] = "blocks"
+    """Held-out frames of workspaces: every fifth block of 10 frames (blocks), the last 20 % (tail), or what the authors
+    of an imported dataset hold out (dataset). Reference captures have their own."""
+    protocol: Protocol | None = None
+    """Score as the authors of an imported dataset do, as for `mien evaluate`; it needs --split dataset."""
+    lpips_weights: Path | None = None
+    """Torchvision's weights, to print exact LPIPS as well, as for `mien evaluate`."""
+    device: DeviceName = "cpu"
+    """Device to train on."""
     out: Path = Path("out/bench-compare")
     """Folder for the tables, trials and reference captures."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -193,20 +175,26 @@ class Compare:
             raise UserError(f"{twice}: two captures have this name; give one of them, or rename its folder")
         for folder in self.workspaces:
             open_workspace(folder)
+        if self.protocol is not None and self.split != "dataset":
+            raise UserError(f"--protocol {self.protocol}: scores what its authors hold out; give --split dataset too")
+        check_device(self.device)
+        check_weights(self.lpips_weights)
         check_writable(self.out, folder=True)
 
     def run(self) -> None:
         """Train and score every method on every capture, then print the table."""
+        from mien.evaluation.protocols import EvaluationSettings
         from mien.pipeline.comparing import run_compare_stage
 
+        scored = EvaluationSettings(video_frames=0, **scoring_of(self.protocol, self.lpips_weights))
         run_compare_stage(
             self.out, [open_workspace(folder) for folder in self.workspaces], self.captures,
-            list(dict.fromkeys(self.methods)), minutes=self.minutes, steps=self.steps, split=self.split,
-            as_json=self.as_json,
+            list(dict.fromkeys(self.methods)), minutes=self.minutes, steps=self.steps, split=self.split, scored=scored,
+            device=self.device, as_json=self.as_json,
         )  # fmt: skip
 
 
-TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
+TASKS = {"render": Render, "train-step": TrainStep, "quality": Quality, "compare": Compare}
 
 
 def show_rows(

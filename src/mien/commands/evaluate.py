@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -63,7 +63,7 @@ class Run:
 
     def check(self) -> None:
         """Check without heavy libraries that there is such a run."""
-        _check_weights(self.lpips_weights)
+        check_weights(self.lpips_weights)
         open_workspace(self.workspace).pick_run(self.run_name)
 
     def run(self) -> None:
@@ -71,17 +71,13 @@ class Run:
         from mien.evaluation.protocols import EvaluationSettings
         from mien.pipeline.evaluate import run_evaluation_stage
 
-        frames = 0 if self.protocol is not None and self.lpips_weights is not None else _FRAMES
+        chosen = scoring_of(self.protocol, self.lpips_weights, self.edges)
+        if self.perceptual_frames is not None:
+            chosen["perceptual_frames"] = self.perceptual_frames
         settings = EvaluationSettings(
-            perceptual=self.perceptual,
-            perceptual_frames=frames if self.perceptual_frames is None else self.perceptual_frames,
-            pictures=self.pictures,
-            lpips_weights=self.lpips_weights,
-            edges="filmed" if self.protocol is not None else self.edges,
-            protocol=self.protocol,
-            fit_faces=self.fit_faces,
-            fit_steps=self.fit_steps,
-        )
+            perceptual=self.perceptual, pictures=self.pictures, fit_faces=self.fit_faces, fit_steps=self.fit_steps,
+            **chosen,
+        )  # fmt: skip
         workspace = open_workspace(self.workspace)
         metrics = run_evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)
         if self.as_json:
@@ -149,7 +145,7 @@ class Images:
 
     def check(self) -> None:
         """Check without heavy libraries that there are pictures."""
-        _check_weights(self.lpips_weights)
+        check_weights(self.lpips_weights)
         for path in (self.images, self.truth):
             if not path.exists():
                 raise UserError(f"{path}: no such folder; give a folder of pictures, or a video")
@@ -171,6 +167,14 @@ class Images:
 TASKS = {"": Run, "compare": Compare, "images": Images}
 
 
-def _check_weights(weights: Path | None) -> None:
+def scoring_of(protocol: Protocol | None, weights: Path | None, edges: str = "cleaned") -> dict[str, Any]:
+    """Settings of an evaluation by a dataset's protocol and with LPIPS, whose papers score every frame."""
+    frames = 0 if protocol is not None and weights is not None else _FRAMES
+    edges = edges if protocol is None else "filmed"
+    return {"protocol": protocol, "lpips_weights": weights, "edges": edges, "perceptual_frames": frames}
+
+
+def check_weights(weights: Path | None) -> None:
+    """Check that the file of `--lpips-weights` is there."""
     if weights is not None and not weights.is_file():
         raise UserError(f"--lpips-weights {weights}: no such file; give torchvision's file of AlexNet")

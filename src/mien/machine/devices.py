@@ -45,6 +45,17 @@ def choose_device(name: DeviceName) -> "torch.device":
     return torch.device("cuda")
 
 
+def gpu_memory_mb(device: "torch.device", *, restart: bool = False) -> float:
+    """The most memory that tensors of this process have had on a GPU since a restart, in MiB; 0 for the CPU."""
+    import torch
+
+    if device.type != "cuda":
+        return 0.0
+    if restart:
+        torch.cuda.reset_peak_memory_stats(device)
+    return torch.cuda.max_memory_allocated(device) / (1 << 20)
+
+
 def like_on(device: "torch.device | str") -> "torch.Tensor":
     """A float32 scalar on a device, to pass to the method `to(like)` of the value objects."""
     import torch

@@ -17,19 +17,22 @@ from mien.face.loading import load_face_model
 from mien.lab.benchmarking.comparing import MethodRow, comparison_table
 from mien.lab.benchmarking.timing import measure_machine
 from mien.lab.synthetic.references import ReferenceCapture, reference_named
+from mien.machine.devices import DeviceName
 from mien.machine.progress import say
 from mien.machine.terminal import show
 from mien.pipeline.evaluate import run_evaluation_stage
 from mien.pipeline.quality import StageTimes, draw_and_track, reference_settings, score_unseen_views
-from mien.pipeline.train import run_training_stage
+from mien.pipeline.train import fill_in_split, run_training_stage
 from mien.training.footage.frames import training_frames
 from mien.training.footage.sequence import Sequence, read_sequence
 from mien.training.run import read_training_summary
 from mien.training.settings import PRESETS, TrainSettings
+from mien.training.settings.splits import Recordings
 from mien.training.trainer import train
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
-_SCORED, _PRESET = EvaluationSettings(video_frames=0), PRESETS["standard"]
+_PRESET = PRESETS["standard"]
+Split = Literal["blocks", "tail", "dataset"]
 FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
 """Least and largest number of steps of the first trial. Between them, it uses each training frame once."""
 _TRIAL_SHARE = 0.1
@@ -60,18 +63,21 @@ def run_compare_stage(
     *,
     minutes: float,
     steps: int,
-    split: Literal["blocks", "tail"],
+    split: Split,
+    scored: EvaluationSettings,
+    device: DeviceName,
     as_json: bool,
 ) -> None:
     """Train and score every method on every capture, and print the table. Writes OUT/compare.json and compare.md.
 
     The captures are tracked workspaces, and reference captures, which are drawn, captured and tracked in OUT first.
-    Each method trains for `minutes`, or else `steps`, or else as long as its preset says. `split` is that of
-    workspaces; reference captures have their own.
+    Each method trains on `device` for `minutes`, or else `steps`, or else as long as its preset says. `split` is that
+    of workspaces; reference captures have their own. `scored` says how runs are scored.
     """
     budget = f"{minutes:g}min" if minutes else f"{steps}" if steps else "full"
     references = [reference_named(name) for name in captures]
     chosen = {"methods": list(methods), "budget": {"minutes": minutes, "steps": steps}, "split": split}
+    chosen |= {"protocol": scored.protocol, "device": device}
     rows: list[MethodRow] = []
     content: dict[str, Any] = {}
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
@@ -80,10 +86,10 @@ def run_compare_stage(
             for method in methods:
                 say(f"== {subject.name}: {method}")
                 run = "-".join([COMPARED + method, budget, *([] if split == "blocks" else [split])])
-                own = replace(subject.settings, steps=_PRESET.settings_of(method).steps)
+                own = replace(subject.settings, steps=_PRESET.settings_of(method).steps, device=device)
                 trials = out / "trials" / subject.name / run
                 own = replace(own, steps=steps_for(subject, _PRESET.config(method), own, minutes, steps, trials))
-                rows.append(_row(subject, method, run, own))
+                rows.append(_row(subject, method, run, own, scored))
                 content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": list(map(asdict, rows))}
                 content = json.loads(json.dumps(content))
                 write_json(out / "compare.json", _FORMAT, _VERSION, content)
@@ -92,12 +98,13 @@ def run_compare_stage(
     say(f"The table is in {out / 'compare.md'}")
 
 
-def of_workspace(workspace: Workspace, split: Literal["blocks", "tail"]) -> Subject:
+def of_workspace(workspace: Workspace, split: Split) -> Subject:
     """The tracked workspace as something to compare on."""
-    names = workspace.tracked_names()
-    if not names:
+    given = dict.fromkeys(workspace.tracked_names())
+    if not given:
         raise UserError(f"{workspace.root}: no tracked sequences; run `mien track {workspace.root}`")
-    return Subject(workspace.root.resolve().name, workspace, names, replace(_PRESET.settings, split=split))
+    settings = replace(_PRESET.settings, split=split)
+    return Subject(workspace.root.resolve().name, workspace, *fill_in_split(workspace, settings, Recordings(given)))
 
 
 def _of_reference(reference: ReferenceCapture, out: Path) -> Subject:
@@ -107,11 +114,11 @@ def _of_reference(reference: ReferenceCapture, out: Path) -> Subject:
     return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 
 
-def _row(subject: Subject, method: str, run: str, settings: TrainSettings) -> MethodRow:
+def _row(subject: Subject, method: str, run: str, settings: TrainSettings, scored: EvaluationSettings) -> MethodRow:
     """Train and score a method on a capture, unless that is done."""
     workspace, run_dir = subject.workspace, subject.workspace.run_dir(run)
     run_training_stage(workspace, subject.sequences, run, _PRESET.config(method), settings)
-    metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
+    metrics = run_evaluation_stage(workspace, run, scored, again=False)
     summary, unseen = read_training_summary(run_dir), {}
     if subject.reference is not None and subject.drawn is not None:
         unseen = score_unseen_views(subject.reference, subject.drawn, workspace, run)

@@ -13,6 +13,7 @@ from mien.avatar.store import Moments
 from mien.disk.files import read_tensors, write_tensors
 from mien.disk.reading import expect_whole
 from mien.errors import UserError
+from mien.machine.devices import gpu_memory_mb
 from mien.machine.progress import say
 from mien.machine.system import peak_memory_mb
 from mien.training.adam import Adam
@@ -45,7 +46,9 @@ class TrainingState:
     seconds: float = 0.0
     """Time spent on these steps, in seconds, by all processes that have trained the run."""
     peak_memory_mb: float = 0.0
-    """Most memory that one of these processes has taken, in MB, when it was last measured."""
+    """Most memory of the host that one of these processes has taken, in MB, when it was last measured."""
+    gpu_memory_mb: float = 0.0
+    """The same for the tensors on the GPU; 0 for a run on the CPU."""
 
     @property
     def colors(self) -> list[FrameGains | CameraColors]:
@@ -58,8 +61,9 @@ class TrainingState:
         return head | {own.learned.name: own.learned for own in self.colors}
 
     def measure_memory(self) -> None:
-        """Bring `peak_memory_mb` up to date."""
+        """Bring `peak_memory_mb` and `gpu_memory_mb` up to date."""
         self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
+        self.gpu_memory_mb = max(self.gpu_memory_mb, gpu_memory_mb(self.avatar.face_model.template.device))
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
@@ -81,6 +85,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
         "peak_memory_mb": torch.tensor(state.peak_memory_mb, dtype=torch.float64),
         "gaussians": torch.tensor(len(state.avatar.store)),
     }
+    if state.gpu_memory_mb:
+        tensors["gpu_memory_mb"] = torch.tensor(state.gpu_memory_mb, dtype=torch.float64)
     write_tensors(folder / f"step_{state.step:07d}.safetensors", tensors, {"format": "mien.checkpoint", "version": "1"})
     # Also delete unfinished files of a process that was killed while it wrote.
     for old in (*checkpoint_files(folder)[:-_KEPT_CHECKPOINTS], *folder.glob(".step_*")):
@@ -137,6 +143,7 @@ def _restore(path: Path, state: TrainingState, tensors: dict[str, Tensor]) -> No
         joined.load_state(part(f"{prefix}."))
     state.step, state.seconds = int(tensors["step"]), float(tensors["seconds"])
     state.peak_memory_mb = float(tensors["peak_memory_mb"])
+    state.gpu_memory_mb = float(tensors.get("gpu_memory_mb", 0.0))
     curves = part("curves.")
     if state.step < 0 or len({curve.shape for curve in curves.values()}) > 1 or ("loss" in curves) != bool(curves):
         raise ValueError("its step or its curves are not valid")

@@ -203,12 +203,13 @@ def write_results(run_dir: Path, state: TrainingState, covered: Coverage) -> Non
         "gaussians": len(state.avatar.store),
         "step_ms_median": round(float(np.median(state.curves["step_ms"])), 3),
         "peak_memory_mb": round(state.peak_memory_mb, 1),
+        **({"gpu_memory_mb": round(state.gpu_memory_mb, 1)} if state.gpu_memory_mb else {}),
     }
     write_json(run_dir / "training.json", _SUMMARY, _VERSION, summary)
 
 
 def read_training_summary(run_dir: Path) -> dict[str, Any]:
-    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run."""
+    """`steps, seconds, gaussians, step_ms_median, peak_memory_mb` of a finished run; on a GPU also `gpu_memory_mb`."""
     if (run_dir / "config.json").is_file() and not is_finished(run_dir):
         raise UserError(
             f"{run_dir}: its training was not finished; run the same `mien train` or `mien create` again, which goes "

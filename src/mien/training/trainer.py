@@ -25,7 +25,7 @@ from mien.face.checks import check_face_params
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
 from mien.gaussians import Rendering
-from mien.machine.devices import choose_device, like_on
+from mien.machine.devices import choose_device, gpu_memory_mb, like_on
 from mien.machine.progress import Advance, progress_bar
 from mien.machine.stops import stops_put_off
 from mien.machine.threads import one_torch_thread
@@ -114,6 +114,7 @@ def train(
         if is_finished(run_dir):  # another process finished it before this one got the lock
             return load_avatar(run_dir)
         like = like_on(choose_device(settings.device))
+        gpu_memory_mb(like.device, restart=True)
         state = start(sequences, face_model, method_config, settings, like)
         head = state.head
         inside = None if head is None else head.hideable

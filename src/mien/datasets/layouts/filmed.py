@@ -133,6 +133,28 @@ def as_flame(
     return whole, held, *motion_between(face_of_flame(folder, filmed.face_model, held), face)
 
 
+def vectors(filmed: Filmed, count: int) -> tuple[Float[np.ndarray, "t n"], tuple[str, ...]]:
+    """Return `count` numbers a timestep in place of a foreign model's expressions, and what is said of them.
+
+    If there is no room for all expressions, those that change most are kept.
+    """
+    face, model = filmed.face(), filmed.face_model
+    moved = [name for name in model.free_joint_names if name != "neck"]
+    joints = [face.joints[:, model.free_joint_names.index(name)] for name in moved]
+    room = count - 3 * len(joints)
+    values = face.expression.double().numpy()
+    kept = np.sort(np.argsort(-values.std(0), kind="stable")[:room])
+    lost = values.shape[1] - len(kept)
+    columns = [values[:, kept], *(joint.double().numpy() for joint in joints)]
+    told = (
+        f"expression: {len(kept)} expression coefficients of {model.name}, then axis-angles of "
+        f"{', '.join(moved) or 'no joint'}, then zeros. They are not the {count} of the layout's own model.",
+        "Lost: the neck joint, identity and the mesh itself.",
+        *[f"Lost: the {lost} expression coefficients that change least."][: lost > 0],
+    )
+    return padded(np.concatenate(columns, axis=1), count), told
+
+
 def padded(values: np.ndarray, count: int) -> np.ndarray:
     """Return coefficients with `count` columns: zeros are added, and those beyond are left out."""
     whole = np.zeros((*values.shape[:-1], count))

@@ -29,7 +29,7 @@ class Written:
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout of files. Its writer is the function `write` of the file in this folder that has its name."""
+    """A layout of files. Its writer is the function `write` of the file with its name, in underscores."""
 
     name: str
     """Name for `mien export-dataset --format`."""
@@ -42,7 +42,7 @@ class Layout:
 
     def write(self, folder: Path, filmed: "Filmed") -> Written:
         """Write a capture into a new folder."""
-        return import_module(f"mien.datasets.layouts.{self.name}").write(folder, filmed)
+        return import_module(f"mien.datasets.layouts.{self.name.replace('-', '_')}").write(folder, filmed)
 
 
 def check_new_folder(folder: Path) -> None:
@@ -58,6 +58,8 @@ LAYOUTS = (
     Layout("insta", "INSTA, GaussianBlendshapes and RGBAvatar"),
     Layout("imavatar", "IMavatar, PointAvatar, MonoGaussianAvatar and SplattingAvatar", needs_flame=True),
     Layout("nerface", "NeRFace"),
+    Layout("nerf-blendshape", "NeRFBlendShape"),
+    Layout("avatar-mav", "AvatarMAV"),
     Layout("nersemble", "the NeRSemble benchmark (version 2)", one_camera=False),
 )
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mien.datasets.layouts.filmed import Filmed, lost_words, padded
+from mien.datasets.layouts.filmed import Filmed, vectors
 from mien.datasets.layouts.layout import Written
 from mien.datasets.layouts.writing import write_plain_json
 from mien.datasets.overlay import spread_out
@@ -22,7 +22,7 @@ _MIRROR = np.diag([-1.0, 1.0, 1.0])
 def write(folder: Path, filmed: Filmed) -> Written:
     """Write the files of a person of NeRFace."""
     poses, scale = _poses(filmed)
-    vectors, told = _vectors(filmed)
+    values, told = vectors(filmed, _NUMBERS)
     rows = {timestep: index for index, timestep in enumerate(filmed.timesteps)}
     spread = spread_out(len(filmed.trained), _VALIDATED)
     parts = {"train": filmed.trained, "val": tuple(filmed.trained[index] for index in spread), "test": filmed.held_out}
@@ -34,7 +34,7 @@ def write(folder: Path, filmed: Filmed) -> Written:
                 {
                     "file_path": f"./{part}/f_{number:04d}",
                     "transform_matrix": poses[rows[timestep]].tolist(),
-                    "expression": vectors[rows[timestep]].tolist(),
+                    "expression": values[rows[timestep]].tolist(),
                     "bbox": _box(filmed, timestep),
                 }
             )
@@ -62,25 +62,6 @@ def _poses(filmed: Filmed) -> tuple[np.ndarray, float]:
     poses[:, :3, :3] = -_MIRROR @ turned
     poses[:, :3, 3] = scale * centers @ _MIRROR
     return poses, scale
-
-
-def _vectors(filmed: Filmed) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The numbers [t, 76] in place of NeRFace's expressions, and what they are."""
-    face, model = filmed.face(), filmed.face_model
-    moved = [name for name in model.free_joint_names if name != "neck"]
-    joints = [face.joints[:, model.free_joint_names.index(name)] for name in moved]
-    room = _NUMBERS - 3 * len(joints)
-    values = face.expression.double().numpy()
-    kept = min(room, values.shape[1])
-    columns = [values[:, :kept], *(joint.double().numpy() for joint in joints)]
-    whole = padded(np.concatenate(columns, axis=1), _NUMBERS)
-    told = (
-        f"expression: {kept} expression coefficients of {model.name}, then axis-angles of "
-        f"{', '.join(moved) or 'no joint'}, then zeros. They are not the 76 of NeRFace's own model.",
-        "Lost: the neck joint, identity and the mesh itself.",
-        *lost_words("expression", values, room),
-    )
-    return whole, told
 
 
 def _intrinsics(filmed: Filmed) -> dict[str, Any]:

@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from mien.camera import Box
 from mien.datasets.layouts.filmed import Filmed
@@ -14,7 +16,7 @@ from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.evaluation.image_folders import CROPS_NAME, write_crops
 from mien.machine.terminal import counted
-from mien.media.picture_files import write_png
+from mien.media.picture_files import encode_picture, write_png
 from mien.tracking.scoring import head_crop
 
 README = "README.txt"
@@ -47,6 +49,13 @@ def write_layout(folder: Path, filmed: Filmed, layout: Layout) -> str:
     cameras = len(filmed.sequence.capture.camera_ids)
     seen = f", {cameras} cameras" if cameras > 1 else ""
     return f"{counted(len(filmed.trained), 'training frame')}, {len(filmed.held_out)} held out{seen}; see {README}"
+
+
+def write_jpg(path: Path, picture: UInt8[np.ndarray, "h w *c"]) -> None:
+    """Write a grey or an RGB picture as .jpg, with as little loss as that has."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    best = (cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+    path.write_bytes(encode_picture(picture, ".jpg", best))
 
 
 def write_plain_json(path: Path, content: Any) -> None:

@@ -18,12 +18,11 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.analysis import measuring
-from mien.lab.analysis.measuring import draw_avatar, mean_psnr, mouth_box, mouth_camera
+from mien.lab.analysis.measuring import draw_avatar, mean_psnr, measured_on, mouth_box, mouth_camera
 from mien.lab.analysis.result import Chart, Picture, Result, Table
 from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
-from mien.machine.terminal import counted
 from mien.media.pictures import side_by_side, to_uint8
 from mien.pages.pages import Axes, Series
 from mien.render import rasterize
@@ -52,7 +51,7 @@ def growth(context: Context) -> Result:
     at_peak = times[gaussians >= peak * (1 - _NEAR)]
     few, many = (float(np.median(part)) for part in (times[gaussians <= start * (1 + _NEAR)], at_peak))
     grown, slower = peak / max(start, 1), many / max(few, 1e-9)
-    memory = context.summary["peak_memory_mb"]
+    memory, gpu = context.summary["peak_memory_mb"], context.summary.get("gpu_memory_mb")
     values = {
         "gaussians_start": int(start),
         "gaussians_peak": int(peak),
@@ -61,6 +60,7 @@ def growth(context: Context) -> Result:
         "step_ms_peak": round(many, 3),
         "step_time_growth": round(slower, 3),
         "training_peak_memory_mb": memory,
+        "training_gpu_memory_mb": gpu,
         "paper": {"gaussians_start": _PAPER_START, "gaussians_end": _PAPER_END, "step_time_growth_at_most": 2.0},
     }
     rows = (
@@ -70,7 +70,8 @@ def growth(context: Context) -> Result:
         ("Step, with Gaussians as at the start, ms", round(few, 1), None),
         ("Step, with the most Gaussians, ms", round(many, 1), None),
         ("Step time grows, times", round(slower, 2), "at most 2"),
-        ("Memory of training, most, MB", round(memory), "fits 12 GB of a GPU"),
+        ("Memory of the GPU in training, most, MB", gpu and round(gpu), "fits 12 GB"),
+        ("Memory of the host in training, most, MB", round(memory), None),
     )
     finding = (
         f"Step time grows {slower:.1f} times while Gaussians grow {grown:.1f} times. In the paper it at most doubles "
@@ -80,7 +81,8 @@ def growth(context: Context) -> Result:
         "Step times are medians: over the steps with at most 5 % more Gaussians than at the start, and over those with "
         "at least 95 % of the most. Other work on the machine during training changes them.",
         "The paper's figures are those of section C of its supplement, for 600,000 steps on a GPU.",
-        "Memory of training is that of the whole process, libraries and pictures included.",
+        "Memory of the GPU is that of all tensors on it; a training on a CPU has none. That of the host is of the "
+        "whole process, libraries and pictures included.",
         *_doubts(at_peak, peak, config.density.max_gaussians),
     ]
     charts = _growth_charts(steps, gaussians, times, few)
@@ -117,46 +119,24 @@ def _growth_charts(steps: np.ndarray, gaussians: np.ndarray, times: np.ndarray, 
         np.array([steps[part].mean() for part in windows]),
         np.array([np.median(times[part]) for part in windows]),
     )
-    x, y = binned(gaussians, times)
-    start = max(float(gaussians[0]), 1)
-    line = np.array([1.0, max(10.0, float(gaussians.max()) / start)])
-    relative = [
-        Series("this run", x / start, y / max(few, 1e-9)),
-        Series("paper: at most", np.array([1.0, 10.0]), np.array([1.0, 2.0]), "second"),
-        Series("in proportion", line, line, "quiet"),
-    ]
+    most = Series("paper: at most", ends, np.full(2, 2 * few), "second")
     return [
         Chart("growth-gaussians", "Fig. 3a: number of Gaussians", number, Axes("step", "Gaussians", from_zero=True)),
         Chart(
             "growth-step-time",
             "Fig. 3b: time of a step, ms",
-            [Series("single steps", steps, single, "quiet"), middle],
+            [Series("single steps", steps, single, "quiet"), middle, most],
             Axes("step", "ms", from_zero=True),
-        ),
-        Chart(
-            "growth-ratio",
-            "Step time over the number of Gaussians, both relative to the start",
-            relative,
-            Axes("Gaussians, times", "step time, times", from_zero=True),
-            "The lower, the better: on the quiet line, a step takes as many times longer as there are more Gaussians.",
         ),
     ]
 
 
-def binned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The medians of x and y in 12 bins of x."""
-    edges = np.linspace(x.min(), x.max(), 13)
-    bins = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, 11)
-    filled = [bins == index for index in np.unique(bins)]
-    return np.array([np.median(x[here]) for here in filled]), np.array([np.median(y[here]) for here in filled])
-
-
 def speed(context: Context) -> Result:
     """Frames per second, at all threads, and memory at the five sizes of Table 3."""
-    seconds, machine = context.options.seconds, format_machine(measure_machine())
+    seconds, machine = context.options.seconds, format_machine(measure_machine(gpu=context.like.is_cuda))
     rows: list[dict[str, Any]] = []
     for size in track_progress(list(TABLE_3), "speed", len(TABLE_3)):
-        row = measuring.measure_drawing(context.avatar, context.camera.fitted(*size), seconds)
+        row = measuring.measure_drawing(context.timed_avatar, context.camera.fitted(*size), seconds)
         fps = round(1e3 / max(row["draw_ms"] + row["pose_ms"], 1e-6), 2)
         rows.append({**row, "fps": fps, "paper_fps": TABLE_3[size]})
     cells = [
@@ -170,7 +150,7 @@ def speed(context: Context) -> Result:
         "Width x height", "Frames/s", "Paper", "Drawing, ms", "Posing, ms", "Pictures timed", "Memory added, MB",
         "Memory in all, MB",
     )  # fmt: skip
-    count, threads, second = len(context.avatar.store), rows[0]["threads"], rows[1]
+    count, threads, second, place = len(context.avatar.store), rows[0]["threads"], rows[1], measured_on(rows[1])
     slower = rows[0]["fps"] / max(rows[-1]["fps"], 1e-6)
     pixels = np.array([row["width"] * row["height"] for row in rows]) / 1e6
     ours, paper = (np.array([row[name] for row in rows], np.float64) for name in ("fps", "paper_fps"))
@@ -180,7 +160,7 @@ def speed(context: Context) -> Result:
     return Result(
         {"machine": machine, "gaussians": count, "threads": threads, "rows": rows},
         [
-            f"{count:,} Gaussians at 550x802, with {counted(threads, 'thread')} of a CPU: {second['fps']:.1f} "
+            f"{count:,} Gaussians at 550x802, with {place}: {second['fps']:.1f} "
             f"frames/s; the paper reports {second['paper_fps']} on a GPU. From 225x401 to 4400x6416, pixels grow 313 "
             f"times and a frame takes {slower:.0f} times as long (paper: {187 / 36:.1f} times)."
         ],
@@ -189,7 +169,7 @@ def speed(context: Context) -> Result:
             Chart(
                 "speed",
                 "Table 3: frames per second over the size of the picture",
-                [Series("this run, on a CPU", pixels, ours), Series("paper, on a GPU", pixels, paper, "second")],
+                [Series(f"this run, {place}", pixels, ours), Series("paper, a GPU", pixels, paper, "second")],
                 Axes("megapixels, from 225x401 to 4400x6416", "frames/s", logarithmic=True),
                 "Both axes are logarithmic.",
             )
@@ -199,7 +179,7 @@ def speed(context: Context) -> Result:
             "A frame is posed and drawn from the camera of training, fitted into the picture, over white. Times are "
             f"medians; each row took about {seconds:g} s.",
             "The paper does not name the GPU of Table 3. Its model has about 100,000 Gaussians.",
-            "Memory added is the largest memory of the process while it draws, less its memory before.",
+            "Memory added is the largest while drawing, less that before: of the process, or of the tensors on a GPU.",
         ],
     )
 
@@ -385,7 +365,7 @@ def scale(context: Context) -> Result:
         f"threshold {threshold:g}": context.train("scale-threshold", replace(config, scale_threshold=threshold)),
         "no threshold (0)": context.train("scale-no-threshold", replace(config, scale_threshold=0.0)),
     }
-    avatars = [run.avatar for run in runs.values()]
+    avatars = [run.timed_avatar for run in runs.values()]
     drawn = measuring.measure_in_turn(avatars, context.camera.fitted(550, 802), context.options.seconds)
     sizes, late = ([measure(run) for run in runs.values()] for measure in (_median_scale, _late_step_ms))
     rows = [
@@ -419,7 +399,6 @@ def scale(context: Context) -> Result:
         },
         findings,
         [Table(heading, rows)],
-        _scale_charts(runs),
         notes=[
             "With a threshold of 0, the loss shrinks every Gaussian. The supplement expects that more of them are then "
             "blended before a ray ends. Both trainings have the same settings, seed and frames.",
@@ -444,23 +423,3 @@ def _score(run: Run) -> float | None:
     if run.experiment is None:
         return None
     return round(mean_psnr(run.experiment, spread_frames(run.experiment.held_out_frames, 16)), 2)
-
-
-def _scale_charts(runs: dict[str, Run]) -> list[Chart]:
-    charts = []
-    for curve, title in (("step_ms", "Time of a step, ms"), ("gaussians", "Number of Gaussians")):
-        series = []
-        for (name, run), style in zip(runs.items(), ("main", "second"), strict=True):
-            values = run.curves[curve]
-            if curve == "step_ms":
-                values = _smooth(np.minimum(values, np.percentile(values, 98)))
-            series.append(Series(name, run.curves["step"], values, style))
-        name = f"scale-{curve.replace('_', '-')}"
-        charts.append(Chart(name, title, series, Axes("step", title, from_zero=True)))
-    return charts
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """The running median over a twentieth of the curve."""
-    reach = max(1, len(values) // 40)
-    return np.array([np.median(values[max(0, i - reach) : i + reach + 1]) for i in range(len(values))])

@@ -1,11 +1,12 @@
 """The analysis of HeadGaS (Dhamo et al., ECCV 2024): the figures and the ablation table of the paper's supplement."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Any, get_args
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +15,9 @@ from torch import Tensor
 from mien.avatar.headgas.avatar import HeadGas
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.camera import Camera
-from mien.evaluation.experiment import avatar_image, target_image
+from mien.errors import UserError
+from mien.evaluation.experiment import Experiment
+from mien.evaluation.metrics import crop_to
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, world_means
@@ -22,28 +25,34 @@ from mien.lab.analysis.measuring import (
     draw_avatar,
     draw_mesh,
     head_camera,
-    head_picture,
     held_out_scores,
     labeled,
     measure_drawing,
+    measured_on,
+    mouth_box,
     mouth_camera,
     perceptual_metric,
+    picture_of_runs,
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
-from mien.lab.analysis.running import Context, Run
+from mien.lab.analysis.running import Context
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
-from mien.machine.terminal import counted
 from mien.media.pictures import picture_grid, side_by_side
 from mien.media.video import write_video
 from mien.pages.pages import Axes, Series
 from mien.render.camera_paths import turned_camera
 from mien.runtime.filmed import head_angles
+from mien.training.footage.frames import Frame
+from mien.training.footage.sequence import Sequence as TrainedSequence
+from mien.training.run import read_face_track
 
 SIDE = 224
 """Width and height of a picture, in pixels."""
 _FPS = 25.0
+_INNER_LIPS, _EYE_CORNERS = (13, 14), (33, 263)
+"""Landmarks in the middle of the inner lips, and at the outer eye corners."""
 _FAINT = 1 / 255
 """Opacity below which a Gaussian is not drawn."""
 _REACH = 1.4
@@ -179,18 +188,20 @@ def start_of_bases(subject: FaceParams, model: FaceModel) -> tuple[FaceParams, i
 
 
 def layers(context: Context) -> Result:
-    """The avatar at rest, and its mouth, without the nearest Gaussians: Fig. 2."""
+    """The avatar at rest, and its mouth in a filmed frame with shut lips, without the nearest Gaussians: Fig. 2."""
     avatar, model, subject = context.avatar, context.avatar.face_model, context.avatar.subject
-    with torch.no_grad():
-        gaussians = avatar.pose(subject).gaussians.timestep(0)
+    shut, told, truth = _shut_frame(context)
+    face, filming = (subject, context.camera) if shut is None else shut
     views = {
-        "head": head_camera(model, subject, context.camera, SIDE),
-        "mouth": mouth_camera(model, subject, context.camera, SIDE),
+        "head": (subject, head_camera(model, subject, context.camera, SIDE)),
+        "mouth": (face, mouth_camera(model, face, filming, SIDE)),
     }
-    orders = {name: near_to_far(gaussians, camera) for name, camera in views.items()}
+    with torch.no_grad():
+        posed = {name: avatar.pose(one).gaussians.timestep(0) for name, (one, _) in views.items()}
+    orders, gaussians = {name: near_to_far(posed[name], views[name][1]) for name in views}, posed["head"]
 
     def without(name: str, share: float) -> np.ndarray:
-        return draw_avatar(avatar, subject, views[name], without_nearest(len(gaussians), orders[name], share))
+        return draw_avatar(avatar, *views[name], without_nearest(len(gaussians), orders[name], share))
 
     def film() -> Iterator[np.ndarray]:
         for frame in range(75):
@@ -202,7 +213,9 @@ def layers(context: Context) -> Result:
         values[f"in_{name}"] = len(order)
         shares = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
         drawn = [labeled(without(name, share), f"without {100 * share:.0f} %") for share in shares]
-        caption = f"The {name} of the person at rest, without the nearest Gaussians among the {len(order):,} in view."
+        at = told if name == "mouth" else "The head of the person at rest"
+        drawn = [*(truth if name == "mouth" else ()), *drawn]
+        caption = f"{at}, without the nearest Gaussians among the {len(order):,} in view."
         pictures.append(Picture(f"layers-{name}", side_by_side(drawn), caption))
     write_video(context.folder / "layers.mp4", film(), _FPS)
     return Result(
@@ -214,12 +227,49 @@ def layers(context: Context) -> Result:
         pictures=pictures,
         films=[Film("layers.mp4", "Head and mouth, while up to half of the Gaussians in view are removed.")],
         notes=[
-            "The supplement finds teeth behind closed lips. Look whether they appear here too: that needs frames with "
-            "visible teeth.",
+            "The supplement finds teeth behind closed lips. Look whether they appear here too: that needs other frames "
+            "with visible teeth.",
             "Only Gaussians that are drawn and whose centre is in the picture count. White shows through where no "
             "Gaussian is behind, because no frame shows what is there.",
         ],
     )
+
+
+def _shut_frame(context: Context) -> tuple[tuple[FaceParams, Camera] | None, str, list[np.ndarray]]:
+    """Face and camera of the frame with shut lips (None: nothing tells), what it is, and its picture of the mouth."""
+    try:
+        place, reason = shut_lips(context.sequences), "no picture has landmarks"
+    except UserError as error:
+        place, reason = None, str(error)
+    if place is None:
+        return None, f"The mouth of the person at rest ({reason})", []
+    index, timestep = place
+    sequence, model = context.sequences[index], context.avatar.face_model
+    before = sum(len(one.tracking.face) for one in context.sequences[:index])
+    face = read_face_track(context.run_dir, model)[before + timestep]
+    left, top, width, _ = mouth_box(model, face, camera := sequence.tracking.cameras[0])
+    picture = crop_to(torch.from_numpy(np.array(sequence.capture.images[timestep, 0])), (left, top, width, width))
+    picture = cv2.resize(picture.numpy(), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    told = f"The mouth in {sequence.name}, timestep {timestep}, whose lips are shut: as filmed, then the avatar"
+    return (face, camera), told, [labeled(picture, "filmed")]
+
+
+def shut_lips(sequences: Sequence[TrainedSequence]) -> tuple[int, int] | None:
+    """Sequence and timestep with shut lips: the most frontal view among the tenth whose lips are least apart.
+
+    The gap between the lips is that of the landmarks in the first camera's pictures, relative to the distance of the
+    outer eye corners. None if no picture has landmarks.
+    """
+    found = []
+    for index, one in enumerate(sequences):
+        marks, face = one.capture.landmarks[:, 0].astype(np.float64), one.tracking.face
+        inner, corners = (np.linalg.norm(marks[:, a] - marks[:, b], axis=1) for a, b in (_INNER_LIPS, _EYE_CORNERS))
+        eye = one.tracking.cameras[0].position.numpy()
+        turned = np.linalg.norm(head_angles(face.head_rotation.numpy(), face.head_translation.numpy(), eye), axis=1)
+        for timestep in np.flatnonzero(one.usable()[:, 0] & np.isfinite(inner) & (corners > 0)).tolist():
+            found.append((inner[timestep] / corners[timestep], turned[timestep], index, timestep))
+    least = sorted(found)[: max(1, len(found) // 10)]
+    return min(least, key=lambda each: each[1])[2:] if least else None
 
 
 def near_to_far(gaussians: Gaussians, camera: Camera) -> Int[Tensor, " p"]:
@@ -336,10 +386,11 @@ def view_from(context: Context, trained: Trained, yaw: float) -> Camera:
 
 def sizes(context: Context) -> Result:
     """Milliseconds of a frame with a changed expression, at all threads, against the size of the picture: Fig. 4."""
-    face, machine, seconds = busy_face(context), format_machine(measure_machine()), context.options.seconds
+    face, seconds = busy_face(context), context.options.seconds
+    machine = format_machine(measure_machine(gpu=context.like.is_cuda))
     rows: list[dict[str, Any]] = []
     for side in track_progress(list(SIZES), "sizes", len(SIZES)):
-        row = measure_drawing(context.avatar, context.camera.fitted(side, side), seconds, face)
+        row = measure_drawing(context.timed_avatar, context.camera.fitted(side, side), seconds, face)
         rows.append({**row, "frame_ms": round(row["draw_ms"] + row["pose_ms"], 3), "paper_ms": SIZES[side]})
     cells = [
         (
@@ -349,20 +400,20 @@ def sizes(context: Context) -> Result:
         for row in rows
     ]  # fmt: skip
     heading = ("Width x height", "Frame, ms", "Paper, ms", "Features and network, ms", "Drawing, ms", "Pictures timed")
-    count, threads = len(context.avatar.store), rows[0]["threads"]
+    count, threads, place = len(context.avatar.store), rows[0]["threads"], measured_on(rows[0])
     names = ("width", "frame_ms", "paper_ms")
     sides, ours, paper = (np.array([row[name] for row in rows], np.float64) for name in names)
     slower = rows[-1]["frame_ms"] / max(rows[0]["frame_ms"], 1e-6)
     pixels = (max(SIZES) // min(SIZES)) ** 2
     series = [
-        Series("this run, on a CPU", sides, ours / max(ours[0], 1e-6)),
-        Series("paper, on a GPU", sides, paper / paper[0], "second"),
+        Series(f"this run, {place}", sides, ours / max(ours[0], 1e-6)),
+        Series("paper, a GPU", sides, paper / paper[0], "second"),
     ]
     axes = Axes("side of the picture, pixels", "times the smallest", from_zero=True)
     return Result(
         {"machine": machine, "gaussians": count, "threads": threads, "rows": rows, "slower": round(slower, 3)},
         [
-            f"{count:,} Gaussians, {counted(threads, 'thread')} of a CPU: {rows[0]['frame_ms']:.1f} ms at "
+            f"{count:,} Gaussians, {place}: {rows[0]['frame_ms']:.1f} ms at "
             f"{min(SIZES)}x{min(SIZES)}. With {pixels} times the pixels, a frame takes {slower:.1f} times as long "
             f"(paper, on a GPU: {paper[-1] / paper[0]:.1f} times)."
         ],
@@ -391,7 +442,7 @@ def ablations(context: Context) -> Result:
     camera, face = context.camera.fitted(TIMED_SIDE, TIMED_SIDE), busy_face(context)
     rows: list[dict[str, Any]] = []
     for name, run in runs.items():
-        drawn = measure_drawing(run.avatar, camera, context.options.seconds, face)
+        drawn = measure_drawing(run.timed_avatar, camera, context.options.seconds, face)
         row = {"gaussians": run.summary["gaussians"], "frame_ms": round(drawn["draw_ms"] + drawn["pose_ms"], 2)}
         rows.append({"name": name, **row, **held_out_scores(run, metric)})
     if "no_perceptual" not in configs:
@@ -411,7 +462,7 @@ def ablations(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows, "widths": widths},
         ablation_findings(context.options.steps, rows),
         [Table(heading, cells, "Scores are those of the head crop, means over held-out frames.")],
-        pictures=_ablation_picture(runs),
+        pictures=picture_of_runs("ablations", runs, _strongest),
         notes=[
             f"All trainings have the same data, settings, seed and {context.options.steps:,} steps, which shorten all "
             "schedules alike. The paper trains 50,000. No limit holds the number of Gaussians.",
@@ -471,17 +522,7 @@ def ablation_findings(steps: int, rows: list[dict[str, Any]]) -> list[str]:
     return findings
 
 
-def _ablation_picture(runs: dict[str, Run]) -> list[Picture]:
-    """The held-out frame with the strongest expression: the truth, then each variant."""
-    first = runs["full"].experiment
-    if first is None:
-        return []
-    rest = first.avatar.subject.expression
-    frame = max(first.held_out_frames, key=lambda frame: float((first.face(frame).expression - rest).norm()))
-    tiles = [labeled(head_picture(first, frame, target_image(first, frame)), "truth")]
-    for name, run in runs.items():
-        assert run.experiment is not None
-        tiles.append(labeled(head_picture(run.experiment, frame, avatar_image(run.experiment, frame)), name))
-    sequence = first.sequences[frame.sequence].name
-    caption = f"{sequence}, timestep {frame.timestep}, held out: the truth, and each variant."
-    return [Picture("ablations", side_by_side(tiles), caption)]
+def _strongest(experiment: Experiment) -> Frame:
+    """The held-out frame with the strongest expression."""
+    rest = experiment.avatar.subject.expression
+    return max(experiment.held_out_frames, key=lambda frame: float((experiment.face(frame).expression - rest).norm()))

@@ -1,7 +1,7 @@
 """What the parts of analyses measure and draw: time and memory of drawing, scores of held-out frames, views, labels."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -21,10 +21,13 @@ from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.scoring import score_pictures
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.lab.analysis.result import Picture
 from mien.lab.analysis.running import Run
+from mien.machine.devices import gpu_memory_mb
 from mien.machine.system import peak_memory_mb
+from mien.machine.terminal import counted
 from mien.machine.threads import one_torch_thread
-from mien.media.pictures import WHITE, to_uint8
+from mien.media.pictures import WHITE, side_by_side, to_uint8
 from mien.perceptual.distance import PerceptualDistance, load_perceptual
 from mien.render import rasterize
 from mien.render.mesh import Headlight, render_mesh
@@ -36,18 +39,21 @@ METRICS = ("head_psnr", "head_ssim", "head_perceptual")
 def measure_drawing(
     avatar: Avatar, camera: Camera, seconds: float, face: FaceParams | None = None
 ) -> dict[str, float | int]:
-    """Draw the avatar at a timestep (None: the person at rest) over white, at all threads, for about `seconds`.
+    """Draw the avatar, where it is, at a timestep (None: the person at rest) over white, for about `seconds`.
 
     The first picture warms up and does not count, unless it alone takes longer than `seconds`.
 
     Returns:
         width, height: Size of the picture in pixels.
-        gaussians, threads, pictures: Their numbers; pictures that are timed.
+        gaussians, threads, pictures: Their numbers; no threads on a GPU; pictures that are timed.
         draw_ms, pose_ms: Medians of drawing and of posing, in milliseconds.
-        peak_mb, before_mb: The process's largest memory while drawing, and its memory before, in MiB.
+        peak_mb, before_mb: The largest memory while drawing, and the memory before, in MiB: of the process, or of the
+            tensors on a GPU.
     """
-    before = _restart_peak()
-    white = torch.ones(3)
+    like = avatar.face_model.template
+    face, camera = (avatar.subject if face is None else face).to(like), camera.to(like)
+    before = _restart_peak(like.device)
+    white = like.new_ones(3)
     draws: list[float] = []
     poses: list[float] = []
     spent = 0.0
@@ -55,10 +61,10 @@ def measure_drawing(
         began = time.perf_counter()
         while spent < seconds:
             start = time.perf_counter()
-            gaussians = avatar.pose(avatar.subject if face is None else face).gaussians.timestep(0)
-            middle = time.perf_counter()
+            gaussians = avatar.pose(face).gaussians.timestep(0)
+            middle = _now(like)
             rasterize(gaussians, camera, white)
-            end = time.perf_counter()
+            end = _now(like)
             poses.append(1e3 * (middle - start))
             draws.append(1e3 * (end - middle))
             spent = end - began
@@ -67,11 +73,11 @@ def measure_drawing(
         "width": camera.width,
         "height": camera.height,
         "gaussians": len(avatar.store),
-        "threads": _native.thread_count(),
+        "threads": 0 if like.is_cuda else _native.thread_count(),
         "draw_ms": _median(draws[counted]),
         "pose_ms": _median(poses[counted]),
         "pictures": len(draws[counted]),
-        "peak_mb": round(max(_memory_mb("VmHWM"), before), 1),
+        "peak_mb": round(max(gpu_memory_mb(like.device) or _memory_mb("VmHWM"), before), 1),
         "before_mb": round(before, 1),
     }
 
@@ -81,15 +87,16 @@ def measure_in_turn(avatars: Sequence[Avatar], camera: Camera, seconds: float) -
 
     They are drawn in turn, so that other work on the machine slows all of them alike.
     """
+    like = avatars[0].face_model.template
     with torch.no_grad(), one_torch_thread():
         posed = [avatar.pose(avatar.subject).gaussians.timestep(0) for avatar in avatars]
         times: list[list[float]] = [[] for _ in avatars]
         end = time.perf_counter() + seconds * len(avatars)
         while len(times[0]) < 2 or time.perf_counter() < end:
             for gaussians, own in zip(posed, times, strict=True):
-                start = time.perf_counter()
-                rasterize(gaussians, camera, torch.ones(3))
-                own.append(1e3 * (time.perf_counter() - start))
+                start = _now(like)
+                rasterize(gaussians, camera.to(like), like.new_ones(3))
+                own.append(1e3 * (_now(like) - start))
     return [_median(own[1:]) for own in times]
 
 
@@ -97,8 +104,22 @@ def _median(values: list[float]) -> float:
     return round(sorted(values)[len(values) // 2], 3)
 
 
-def _restart_peak() -> float:
-    """The memory of this process in MiB. Its peak starts again from there, if the system can do that (Linux)."""
+def _now(like: Tensor) -> float:
+    """The time in seconds, once the GPU of `like`, if it is on one, has done its work."""
+    if like.is_cuda:
+        torch.cuda.synchronize(like.device)
+    return time.perf_counter()
+
+
+def measured_on(row: Mapping[str, Any]) -> str:
+    """What drew the pictures of a row of `measure_drawing`, in words."""
+    return f"{counted(row['threads'], 'thread')} of a CPU" if row["threads"] else "a GPU"
+
+
+def _restart_peak(device: torch.device) -> float:
+    """The memory of this process or of a GPU in MiB. Its peak starts again from there, if that can be done (Linux)."""
+    if device.type == "cuda":
+        return gpu_memory_mb(device, restart=True)
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -150,6 +171,21 @@ def mean_psnr(experiment: Experiment, frames: Sequence[Frame]) -> float:
 def head_picture(experiment: Experiment, frame: Frame, image: Tensor) -> UInt8[np.ndarray, "_ _ 3"]:
     """The head crop of a picture of a frame."""
     return to_uint8(crop_to(image, experiment.crop(frame)))
+
+
+def picture_of_runs(name: str, runs: Mapping[str, Run], chosen: Callable[[Experiment], Frame]) -> list[Picture]:
+    """A held-out frame, which is chosen in the first run: the truth, then each run. None if nothing was held out."""
+    tiles, caption, frame = [], "", None
+    for label, run in runs.items():
+        if (experiment := run.experiment) is None:
+            return []
+        if frame is None:
+            frame = chosen(experiment)
+            tiles.append(labeled(head_picture(experiment, frame, target_image(experiment, frame)), "truth"))
+            place = f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}"
+            caption = f"{place}, held out: the truth, then each training."
+        tiles.append(labeled(head_picture(experiment, frame, avatar_image(experiment, frame)), label))
+    return [Picture(name, side_by_side(tiles), caption)]
 
 
 def zoomed(camera: Camera, box: Box, side: int) -> Camera:

@@ -11,25 +11,25 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien import _native
 from mien.avatar.avatar import Avatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
 from mien.avatar.settings import Progress
 from mien.errors import UserError
-from mien.evaluation.experiment import Experiment, avatar_image, target_image
+from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import psnr
 from mien.lab.analysis.measuring import (
     head_picture,
     held_out_scores,
     labeled,
     measure_drawing,
+    measured_on,
     perceptual_metric,
+    picture_of_runs,
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Picture, Result, Table
 from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
-from mien.machine.terminal import counted
 from mien.media.pictures import side_by_side
 from mien.pages.pages import Axes, Series
 from mien.perceptual.distance import PerceptualDistance
@@ -54,8 +54,8 @@ GAINS: dict[int, float] = {512: 0.00625, 1024: 0.0025}
 
 def times(context: Context) -> Result:
     """Minutes of this run's training, and milliseconds of a frame with the networks and with the baked avatar."""
-    machine, avatar, threads = format_machine(measure_machine()), context.avatar, _native.thread_count()
-    rows = {}
+    machine, avatar = format_machine(measure_machine(gpu=context.like.is_cuda)), context.timed_avatar
+    rows: dict[str, dict[str, float | int]] = {}
     for name, training in (("networks", True), ("baked", False)):
         avatar.train(training)
         rows[name] = measure_drawing(avatar, context.camera.fitted(SIDE, SIDE), context.options.seconds)
@@ -69,14 +69,14 @@ def times(context: Context) -> Result:
     return Result(
         {
             "machine": machine,
-            "threads": threads,
+            "threads": rows["baked"]["threads"],
             "gaussians": count,
             "training_hours": round(hours, 4),
             "frame_ms": frames,
             "rows": rows,
         },
         [
-            f"{count:,} Gaussians, {counted(threads, 'thread')} of a CPU: training took {60 * hours:.1f} min, and a "
+            f"{count:,} Gaussians, {measured_on(rows['baked'])}: training took {60 * hours:.1f} min, and a "
             f"frame of the baked avatar takes {frames['baked']:.1f} ms at {SIDE}x{SIDE} (paper, on a GPU: 9 h and "
             "30 ms)."
         ],
@@ -131,7 +131,7 @@ def _snapshots(
     context: Context, experiment: Experiment, frames: list[Frame], steps: list[int]
 ) -> list[tuple[int, int, list[Tensor]]]:
     """Step, number of Gaussians and pictures of `frames` at each of some steps, from one training."""
-    settings, sequences = replace(context.settings, steps=context.options.steps), context.sequences
+    settings, sequences = context.short_settings, context.sequences
     trained = training_frames(sequences, settings)
     extent = camera_extent(sequences, trained)
     snapshots: list[tuple[int, int, list[Tensor]]] = []
@@ -154,15 +154,16 @@ def _snapshots(
 @torch.no_grad()
 def drawn(avatar: Avatar, experiment: Experiment, frame: Frame, progress: Progress) -> Tensor:
     """The avatar's picture of a frame, at this point of its training."""
-    face = experiment.sequences[frame.sequence].tracking.face[frame.timestep]
-    gaussians = avatar.pose(face, progress).gaussians.timestep(0)
-    return rasterize(gaussians, experiment.camera(frame), torch.ones(3)).image
+    face, like = experiment.sequences[frame.sequence].tracking.face[frame.timestep], avatar.face_model.template
+    gaussians = avatar.pose(face.to(like), progress).gaussians.timestep(0)
+    return rasterize(gaussians, experiment.camera(frame).to(like), like.new_ones(3)).image.cpu().float()
 
 
 def resolutions(context: Context) -> Result:
-    """The same short training with pictures of the run's size and of half of it, both scored at full size: A.1.
+    """The same short training with pictures of 1024 and of 512 pixels, both scored at the capture's size: A.1.
 
-    Each has the paper's bound of scales for the size that is nearest to its own.
+    Each has the paper's bound of scales for the size that is nearest to its own. A smaller capture is trained at its
+    own size and at half of it.
     """
     config = context.avatar.config
     assert isinstance(config, MonoGaussianAvatarConfig)
@@ -170,7 +171,8 @@ def resolutions(context: Context) -> Result:
     full = min(context.settings.resolution or capture, capture)
     context.say_how_long("resolutions", 2)
     runs, rows, (metric, notes) = {}, [], perceptual_metric()
-    for side in (full, max(16, full // 2)):
+    small = full < max(GAINS)
+    for side in (full, max(16, full // 2)) if small else (max(GAINS), min(GAINS)):
         name, gain = f"{side} pixels", scale_gain(side)
         runs[name] = context.train(f"resolution-{side}", replace(config, scale_gain=gain), resolution=side)
         rows.append({"name": name, "side": side, "scale_gain": gain, **_scored(runs[name], metric)})
@@ -180,10 +182,12 @@ def resolutions(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         [_finding(rows)],
         [Table(heading, cells, "Scores are those of the head crop at full size, means over held-out frames.")],
-        pictures=_pictures("resolutions", runs),
+        pictures=picture_of_runs("resolutions", runs, _middle),
         notes=[
             "The paper trains at 512x512 and at 1024x1024, and gives scales a smaller bound at 1024x1024. Here, each "
-            "training has the bound of the nearer of these sizes; all else is as in the run.",
+            "training has the bound of the nearer of these sizes; all else is as in the run, which has the paper's "
+            "settings if it was trained with --preset paper or paper-cpu.",
+            *([f"The pictures have {full} pixels; --capture.size 1024 gives more, if the video has them."] * small),
             *notes,
         ],
     )
@@ -195,10 +199,12 @@ def scale_gain(side: int) -> float:
 
 
 def diversity(context: Context) -> Result:
-    """The same short training on all frames, on a frontal quarter, and on half with all poses and expressions: A.4."""
+    """The same short training on all frames, on two clips by time as in the paper, and on two choices by pose: A.4."""
     measured = measure(context.sequences, training_frames(context.sequences, context.settings))
     subsets = {
         "all frames": list(range(len(measured.timesteps))),
+        "frontal clip": clip(measured, 0.25, mixed=False),
+        "mixed clip": clip(measured, 0.5, mixed=True),
         "frontal quarter": frontal_quarter(measured),
         "mixed half": mixed_half(measured),
     }
@@ -219,11 +225,13 @@ def diversity(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         [_finding(rows)],
         [Table(heading, cells, "Scores are those of the head crop, means over the same held-out frames.")],
-        pictures=_pictures("diversity", runs),
+        pictures=picture_of_runs("diversity", runs, _middle),
         notes=[
-            "The frontal quarter has the views nearest to the median one. Each timestep of the mixed half is the one "
-            "that differs most, in tracked pose and expression, from those chosen before it. Ranges of angles are "
-            "between the 2nd and the 98th percentile; the spread of expressions is relative to all frames.",
+            "The paper has a frontal clip of 30 s and a mixed one of 60 s, of 120 s. Here, they are successive "
+            "timesteps, a quarter and half of all: with the views nearest to the median one, and with the most varied.",
+            "The frontal quarter has the single views nearest to the median one. Each timestep of the mixed half is "
+            "the one that differs most, in tracked pose and expression, from those chosen before it. Ranges of angles "
+            "are between the 2nd and the 98th percentile; the spread of expressions is relative to all frames.",
             "All trainings have the same number of steps, so that those on fewer frames see each more often.",
             *notes,
         ],
@@ -247,17 +255,8 @@ def _finding(rows: list[dict[str, Any]]) -> str:
     return f"PSNR of the head crop: {rows[0]['name']} {first:.2f} dB; compared with it, {others}."
 
 
-def _pictures(name: str, runs: dict[str, Run]) -> list[Picture]:
-    """A held-out frame in the middle of those: the truth, then each training."""
-    tiles = []
-    for label, run in runs.items():
-        if (experiment := run.experiment) is None:
-            return []
-        frame = experiment.held_out_frames[len(experiment.held_out_frames) // 2]
-        if not tiles:
-            tiles.append(labeled(head_picture(experiment, frame, target_image(experiment, frame)), "truth"))
-        tiles.append(labeled(head_picture(experiment, frame, avatar_image(experiment, frame)), label))
-    return [Picture(name, side_by_side(tiles), "A held-out frame: the truth, then each training.")]
+def _middle(experiment: Experiment) -> Frame:
+    return experiment.held_out_frames[len(experiment.held_out_frames) // 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,9 +287,26 @@ def measure(sequences: list[Sequence], frames: list[Frame]) -> Measured:
 
 def frontal_quarter(measured: Measured) -> list[int]:
     """The quarter of the timesteps whose view is nearest to the median one, in the order of time."""
-    distance = np.linalg.norm(measured.angles - np.median(measured.angles, axis=0), axis=1)
+    distance = _from_the_front(measured)
     count = max(1, round(0.25 * len(distance)))
     return sorted(np.argsort(distance, kind="stable")[:count].tolist())
+
+
+def clip(measured: Measured, share: float, *, mixed: bool) -> list[int]:
+    """Successive timesteps, `share` of all: those with the views nearest to the median one, or with the most varied."""
+    distance = _from_the_front(measured)
+    count = max(1, round(share * len(distance)))
+
+    def worth(first: int) -> float:
+        part = slice(first, first + count)
+        return float(measured.angles[part].std(0).sum() if mixed else -distance[part].mean())
+
+    first = max(range(len(distance) - count + 1), key=worth)
+    return list(range(first, first + count))
+
+
+def _from_the_front(measured: Measured) -> Float[np.ndarray, " n"]:
+    return np.linalg.norm(measured.angles - np.median(measured.angles, axis=0), axis=1)
 
 
 def mixed_half(measured: Measured) -> list[int]:

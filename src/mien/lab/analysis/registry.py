@@ -10,6 +10,7 @@ from typing import Annotated
 
 from mien.disk.config import Range, check_ranges
 from mien.errors import UserError
+from mien.machine.devices import DeviceName
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class AnalysisOptions:
     """Number of optimiser steps of each short training."""
     seconds: Annotated[float, Range(0.01, 3600)] = 2.0
     """Seconds to spend on each timed row. A row ends after the first picture that exceeds them."""
+    device: DeviceName = "cpu"
+    """Device of short trainings and of timed drawing. Pictures and scores are drawn on the CPU."""
     widen: bool = False
     """Whether the ablations of HeadGaS widen the network without blending until it gets no better."""
 
@@ -73,7 +76,7 @@ _ALL = (
         "HeadGaS (Dhamo et al., ECCV 2024), supplement",
         (
             Part("basis", "What the bases learned: one expression at a time, beside the mesh (Fig. 1)"),
-            Part("layers", "Gaussians removed from near to far (Fig. 2)"),
+            Part("layers", "Gaussians removed from near to far, also of a mouth that is shut (Fig. 2)"),
             Part("beyond", "Beyond the expressions and the views of training (Fig. 3)"),
             Part("sizes", "Time of a frame against the size of the picture (Fig. 4)", timed=True),
             Part("ablations", "The ablations, trained alike (Table 1)", trains=True, timed=True),
@@ -85,8 +88,8 @@ _ALL = (
         (
             Part("times", "Time of training and of a frame (Table 4)", timed=True),
             Part("convergence", "Held-out pictures during a training (Fig. 13)", trains=True),
-            Part("resolutions", "Training at two resolutions (A.1)", trains=True),
-            Part("diversity", "Fewer and less varied frames (A.4)", trains=True),
+            Part("resolutions", "Training at 1024x1024 and 512x512 (A.1)", trains=True),
+            Part("diversity", "Shorter and less varied clips (Fig. 12, A.4)", trains=True),
         ),
     ),
 )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 import mien
 from mien import _native
-from mien.avatar.avatar import Avatar
+from mien.avatar.avatar import Avatar, move_avatar
 from mien.avatar.files import load_avatar
 from mien.avatar.settings import MethodConfig
 from mien.camera import Camera
@@ -32,6 +32,7 @@ from mien.evaluation.load import load_experiments
 from mien.face.model import FaceModel
 from mien.lab.analysis.registry import Analysis, AnalysisOptions, Part
 from mien.lab.analysis.result import section_html
+from mien.machine.devices import DeviceName, choose_device, like_on
 from mien.machine.progress import say
 from mien.pages.pages import render
 from mien.plugins import named
@@ -52,6 +53,8 @@ class Run:
     run_dir: Path
     sequence_dirs: tuple[Path, ...]
     """The folders of the run's sequences, in its order. They may be missing; not every part needs them."""
+    like: Tensor
+    """A number on the device of short trainings and of timed drawing."""
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -75,8 +78,14 @@ class Run:
 
     @cached_property
     def avatar(self) -> Avatar:
-        """The trained avatar."""
+        """The trained avatar, on the CPU."""
         return load_avatar(self.run_dir)
+
+    @cached_property
+    def timed_avatar(self) -> Avatar:
+        """The trained avatar once more, on the device where drawing is timed."""
+        move_avatar(avatar := load_avatar(self.run_dir), self.like)
+        return avatar
 
     @cached_property
     def camera(self) -> Camera:
@@ -104,6 +113,12 @@ class Context(Run):
     """Pictures and films are written here, short trainings below `runs/`."""
     options: AnalysisOptions
 
+    @cached_property
+    def short_settings(self) -> TrainSettings:
+        """The run's settings for `options.steps` steps on the chosen device."""
+        device: DeviceName = "cuda" if self.like.is_cuda else "cpu"
+        return replace(self.settings, steps=self.options.steps, device=device)
+
     def train(
         self,
         name: str,
@@ -118,7 +133,7 @@ class Context(Run):
         pictures, in pixels, and `timesteps` are those of each sequence that may be trained on; None is all.
         """
         model = face_model or self.avatar.face_model
-        settings = replace(self.settings, steps=self.options.steps, checkpoint_every=250)
+        settings = replace(self.short_settings, checkpoint_every=250)
         if resolution is not None:
             settings = replace(settings, resolution=resolution)
         key = [encode(config), encode(settings), self.config["data"], model.content_hash]
@@ -131,7 +146,7 @@ class Context(Run):
             trackings = [replace(one, valid=one.valid & some) for one, some in zip(trackings, timesteps, strict=True)]
         sequences = [replace(one, tracking=own) for one, own in zip(self.sequences, trackings, strict=True)]
         train(sequences, model, config, settings, run_dir)
-        return Run(run_dir, self.sequence_dirs)
+        return Run(run_dir, self.sequence_dirs, self.like)
 
     def say_how_long(self, part: str, trainings: int) -> None:
         """Report beforehand how long the short trainings of a part take, from the pace of the run."""
@@ -180,10 +195,11 @@ def run_analysis(
             "mien": mien.__version__,
             "command_line": sys.argv,
         }
-        context = Context(run_dir, tuple(sequence_dirs), folder, options)
+        context = Context(run_dir, tuple(sequence_dirs), like_on(choose_device(options.device)), folder, options)
         for part in parts:
             timed = [options.seconds, _native.thread_count()] if part.timed else None
-            key = _digest_of([part.name, avatar, [options.steps, options.widen] if part.trains else None, timed])
+            device = context.like.device.type if part.timed or part.trains else None
+            key = _digest_of([part.name, avatar, [options.steps, options.widen] if part.trains else None, timed, device])
             if content["parts"].get(part.name, {}).get("key") == key:
                 say(f"{part.name}: measured before")
             else:
@@ -195,13 +211,10 @@ def run_analysis(
                 say(f"{part.name}: {finding}")
         shown = [one for one in analysis.parts if one.name in content["parts"]]
         page = render(
-            "lab/analysis/templates/analysis.html",
-            title=f"{run_dir.name} · {analysis.method}",
-            paper=analysis.paper,
-            version=mien.__version__,
-            command=shlex.join(["mien", *sys.argv[1:]]),
+            "lab/analysis/templates/analysis.html", title=f"{run_dir.name} · {analysis.method}", paper=analysis.paper,
+            version=mien.__version__, command=shlex.join(["mien", *sys.argv[1:]]),
             sections=[section_html(one.title, content["parts"][one.name], folder) for one in shown],
-        )
+        )  # fmt: skip
         write_json(record, _FORMAT, _VERSION, content)
         write_atomically(folder / "analysis.html", lambda aside: aside.write_text(page, encoding="utf-8"))
     return content

@@ -14,6 +14,9 @@ _QUALITY: tuple[tuple[str, str, int, bool], ...] = (
     ("mouth.psnr", "mouth: PSNR", 2, True),
     ("mouth.perceptual", "ST-LPIPS", 3, False),
     ("psnr", "whole frame: PSNR", 2, True),
+    ("ssim", "SSIM", 3, True),
+    ("l1", "L1", 4, False),
+    ("lpips", "LPIPS", 3, False),
     ("unseen.psnr", "unseen views: PSNR", 2, True),
     ("unseen.perceptual", "ST-LPIPS", 3, False),
 )
@@ -49,7 +52,7 @@ class MethodRow:
     def figures(self, protocol: str) -> dict[str, float | None]:
         """Return every number of the table, by its dotted name. None if it was not computed."""
         entry = self.protocols[protocol]
-        found: dict[str, float | None] = {"psnr": entry["psnr"]}
+        found: dict[str, float | None] = {metric: entry.get(metric) for metric in ("psnr", "ssim", "l1", "lpips")}
         for part in ("head", "eyes", "mouth"):
             for metric in ("psnr", "ssim", "perceptual"):
                 found[f"{part}.{metric}"] = entry.get(part, {}).get(metric)
