@@ -1,8 +1,9 @@
-"""`mien bench render | train-step` writes rows and json that say what was measured."""
+"""`mien bench render | train-step | scaling` writes rows, json and charts that say what was measured."""
 
 import itertools
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,24 +49,32 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
     assert all(0 < row.min_ms <= row.median_ms and row.cpu_ms > 0 for row in rows)
 
 
-def test_drawing_as_json(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    """By the number of Gaussians, size and threads; instruction sets are compared, and restored."""
+def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
-    head_scene, best = render_benchmark.head_scene, _native.rasterize_isa()
-    monkeypatch.setattr(render_benchmark, "head_scene", lambda *_: head_scene(9, 8, 8))
-    assert main(["bench", "render", "--json", "--seconds", "0.001"]) == 0
+    monkeypatch.setattr(render_benchmark, "SIZES", ((40, 30), (32, 32)))
+    chart = tmp_path / "chart.svg"
+    assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gflops"] > 0
     rows = [BenchmarkRow(**row) for row in shown["rows"]]
-    wanted = itertools.product((512, 1024), (5, 20), thread_counts())
-    assert {(row.width, row.gaussians, row.threads) for row in rows if row.gaussians != 30_000} == set(wanted)
+    wanted = itertools.product(((40, 30), (32, 32)), (5, 20), thread_counts())
+    assert {((row.width, row.height), row.gaussians, row.threads) for row in rows} == set(wanted)
     assert all(0 < row.min_ms <= row.median_ms for row in rows)
-    by_set = [row.isa for row in rows if row.gaussians == 30_000]
-    assert (by_set[0], len(by_set)) == (best, 2 * len(set(by_set)))
+    assert all(words in chart.read_text() for words in ("rasterize forward, 1 thread", "40x30", "32x32"))
+    # Instruction sets are compared, and restored.
+    monkeypatch.setattr(render_benchmark, "COUNTS", ())
+    monkeypatch.setattr(
+        render_benchmark, "head_scene", lambda *_, head_scene=render_benchmark.head_scene: head_scene(9, 8, 8)
+    )
+    best = _native.rasterize_isa()
+    shown = [row.isa for row in render_benchmark.render_suite(0.0)]
+    assert shown[0] == best
+    assert len(shown) == 2 * len(set(shown))
     assert _native.rasterize_isa() == best
 
 
 @pytest.mark.parametrize(("line", "told"), [
+    ("scaling --plot chart.jpg", "charts are written as .svg"),
     ("train-step --parts --method headgas", "--parts --method headgas"),
     ("train-step --seconds=0", "--seconds 0: give a number above 0"),
 ])  # fmt: skip

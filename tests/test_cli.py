@@ -88,7 +88,7 @@ def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
     ("create a.mp4 --out here --steps many", ("--steps", "'many'")),
     ("create none.mp4 --out here --method nerf", ("instead of 'nerf'",)),
     ("track here --tracking.keyframes -1", ("--tracking.keyframes -1",)),
-    ("bench nothing", ("nothing", "render, train-step, quality, compare")),
+    ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
     ("evaluate x --protocol None", ("--protocol", "{insta,imavatar,nersemble", "['None']")),
     ("capture x --out y --capture.turn 45", ("'45'", "'--capture.turn'. Expected one of ('0', '90', '180', '270')")),
 ])  # fmt: skip

@@ -61,7 +61,7 @@ import w --out n --dataset nobody; render gone --out a.png; render w --out a.gif
 render w --out b.png --background pinkish; render w --out b.mp4 --motion nobody; drive gone --by a.csv --out b.mp4;
 drive w --by gone --out b.mp4; drive w --by a.csv --out b.mp4 --fps 0; drive w --by camera:/dev/video99;
 drive w --by camera --port 99999; view gone.mien; view w --port 99999; view w --play nobody; export w --out a.obj;
-export w --out gone.ply --series nobody; face-models --name x; face-models --add gone.npz;
+export w --out gone.ply --series nobody; face-models --name x; face-models --add gone.npz; bench scaling --plot a.txt;
 bench quality --steps -1; bench compare gone; bench compare w --methods nerf; study make gone --out a.html;
 study make w --out a.html --side 100; study tally gone.json gone.json; demo --seconds 9999; demo --out a.csv
 """

@@ -57,6 +57,31 @@ class Render(_Timed):
 
 
 @dataclass(frozen=True)
+class Scaling(_Timed):
+    """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
+
+    plot: Path | None = None
+    """File for a chart, .svg (default: no chart)."""
+
+    def check(self) -> None:
+        """Check before any measurement that the chart can be written."""
+        from mien.disk.files import check_writable
+
+        if self.plot is not None:
+            if self.plot.suffix != ".svg":
+                raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
+            check_writable(self.plot)
+
+    def run(self) -> None:
+        """Measure and print the rows, then draw the chart."""
+        from mien.lab.benchmarking.render import scaling_suite, write_scaling_chart
+
+        rows = show_rows(scaling_suite(self.seconds), self.as_json)
+        if self.plot is not None:
+            write_scaling_chart(self.plot, rows)
+
+
+@dataclass(frozen=True)
 class TrainStep(_Timed):
     """Measure a training step (no footage is needed), and posing together with drawing."""
 
@@ -194,7 +219,7 @@ class Compare:
         )  # fmt: skip
 
 
-TASKS = {"render": Render, "train-step": TrainStep, "quality": Quality, "compare": Compare}
+TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
 def show_rows(
