@@ -36,7 +36,7 @@ from mien.lab.analysis.measuring import (
     score_cells,
 )
 from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
-from mien.lab.analysis.running import Context
+from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
 from mien.machine.progress import track_progress
 from mien.media.pictures import picture_grid, side_by_side

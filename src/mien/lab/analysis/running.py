@@ -199,7 +199,8 @@ def run_analysis(
         for part in parts:
             timed = [options.seconds, _native.thread_count()] if part.timed else None
             device = context.like.device.type if part.timed or part.trains else None
-            key = _digest_of([part.name, avatar, [options.steps, options.widen] if part.trains else None, timed, device])
+            trained = [options.steps, options.widen] if part.trains else None
+            key = _digest_of([part.name, avatar, trained, timed, device])
             if content["parts"].get(part.name, {}).get("key") == key:
                 say(f"{part.name}: measured before")
             else:
