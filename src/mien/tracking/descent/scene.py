@@ -124,8 +124,10 @@ def paper_scene(problem: Problem, fit: Fit, refined: PhotometricFit | None = Non
         face_model.faces.contiguous(), face_model.uv[face_model.uv_faces].contiguous(), weights,
         mesh_edges(face_model.faces, used),
     )  # fmt: skip
+    all_of_it = problem.settings.published
+    share = torch.ones(len(face_model.template), 1) if all_of_it else _offset_share(face_model)
     return PaperScene(
-        face_model, layout, fit.subject.bias, mesh, weights, fit.subject.identity.float(), _offset_share(face_model),
+        face_model, layout, fit.subject.bias, mesh, weights, fit.subject.identity.float(), share,
         _neighbors(face_model), _sequences(problem, fit), problem.settings.paper,
     )  # fmt: skip
 
