@@ -130,8 +130,8 @@ class TrackingSettings:
         return self.landmarks
 
     def in_effect(self) -> "TrackingSettings":
-        """The settings that a tracking depends on: those that its schedule does not use are at their defaults."""
-        paper = self.paper if self.schedule == "paper" else PaperSettings()
+        """The settings that a tracking depends on: those that its schedule does not use have the same values always."""
+        paper = self.paper if self.schedule == "paper" else PaperSettings("fast", pass_smoothness=0.0)
         by_pixels = self.schedule != "landmarks" and not self.published
         photometric = self.photometric if by_pixels else PhotometricSettings()
         return replace(self, landmarks=self.landmark_set, paper=paper, photometric=photometric)

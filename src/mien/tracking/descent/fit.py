@@ -1,4 +1,4 @@
-"""The `paper` schedule: gradient descent over all frames in random order, which starts from the result of `fast`."""
+"""The `paper` schedule: the first frame, then each next one, then gradient descent over all frames in random order."""
 
 import math
 from collections.abc import Sequence
@@ -200,10 +200,9 @@ def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -
     cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
     frontal = targets[most_frontal_camera(cameras, face)]
     guess_texture(descent.scene, frontal, descent.moving(frontal, ())[0], descent.state.texture)
-    before, cost = math.inf, math.inf
-    while cost == math.inf or cost < (1 - _FIRST_CONVERGED) * before:
-        before, appearance_first = cost, cost == math.inf
-        cost = turn_of_first(descent, targets, settings.first_steps, appearance_first)
+    before, cost = math.inf, turn_of_first(descent, targets, settings.first_steps, appearance_first=True)
+    while cost < (1 - _FIRST_CONVERGED) * before:
+        before, cost = cost, turn_of_first(descent, targets, settings.first_steps, appearance_first=False)
 
 
 def turn_of_first(
