@@ -75,8 +75,9 @@ def test_the_neck_line_is_one_line_in_space_that_every_camera_projects():
         heights = pixels @ line[:2] + line[2]
         assert heights[:3].abs().max() < 0.05, away
         assert heights[3:].min() > 10, "the head is above it"
-    end_on = replace(CAMERA, viewmat=look_at(center + head[:3, 0], center, sideways))
-    assert abs(float(project_neck_line(bottom, head, end_on)[0])) < 0.3, "level, as the line itself is but a point"
+    for away in ((1.0, 0.2, 0.0), (-1.0, 0.0, 0.0), (1.0, 0.5, 0.1)):
+        side = replace(CAMERA, viewmat=look_at(center + torch.tensor(away), center, sideways))
+        assert abs(float(project_neck_line(bottom, head, side)[0])) < 0.3, "level, where the line would run upwards"
 
 
 def _ring(height: float, radii: tuple[float, float] = (0.06, 0.05)) -> torch.Tensor:

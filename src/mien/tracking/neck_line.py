@@ -14,7 +14,7 @@ from mien.face.params import FaceParams
 _MIDDLE = (0.4, 0.7)  # range of the middle of the neck, as shares of the way from its base to its top. Set by eye
 _BATCH = 32  # number of timesteps posed at once
 _REACH = 0.1  # distance along a direction in space at which it is projected, in metres
-_END_ON = 0.25  # length of the line's piece in a picture, against an upright one, below which it is seen end-on
+_STEEPEST = 0.7  # least sine of the angle between line and neck in a picture, about 45 degrees. Set by eye
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -67,16 +67,16 @@ def project_neck_line(
 ) -> Float[Tensor, " 3"]:
     """Fit one line in space across the bottom vertices, and project it: GaussianAvatars (arXiv:2312.02069), B.
 
-    The line runs from side to side: height and depth are linear in the head's x, by least squares. A camera that sees
-    it end-on has a line across the picture of the head instead. The result (a, b, d) is as in `Tracking.neck_lines`.
+    The line runs from side to side: height and depth are linear in the head's x, by least squares. Where a camera at
+    the side sees it run along the neck, it goes straight across the neck there. The result is as `Tracking.neck_lines`.
     """
     R_world_head, center = T_world_head[:3, :3], vertices.mean(0)
     points = (vertices - center) @ R_world_head
     along = points[:, 0] @ points
     along, up = _REACH * (R_world_head @ along) / along.norm(), _REACH * R_world_head[:, 1]
     first, last, inside, above = camera.project(torch.stack([center - along, center + along, center, center + up]))[0]
-    if (last - first).norm() / 2 < _END_ON * (above - inside).norm():
-        across = (above - inside).flip(0) * above.new_tensor([1.0, -1.0])
+    across = (above - inside).flip(0) * above.new_tensor([1.0, -1.0])
+    if ((last - first) @ across).abs() <= _STEEPEST * (last - first).norm() * across.norm():
         first, last = inside - across, inside + across
     return _line(torch.stack([first, last])[None], inside[None], above[None])[0]
 
