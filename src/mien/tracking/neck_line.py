@@ -52,8 +52,7 @@ def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camer
     bottom = bottom_vertices(face_model)
     up = torch.tensor([0.0, _REACH, 0.0]).to(face.head_translation)
     lines = []
-    for start in range(0, len(face), _BATCH):
-        part = face[start : start + _BATCH]
+    for part in (face[start : start + _BATCH] for start in range(0, len(face), _BATCH)):
         vertices = face_model(part)[:, bottom]
         center = vertices.mean(1)
         above = center + part.T_world_head[:, :3, :3] @ up

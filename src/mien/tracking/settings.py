@@ -125,9 +125,7 @@ class TrackingSettings:
     @property
     def landmark_set(self) -> LandmarkSet:
         """The landmarks that count."""
-        if self.landmarks == "auto":
-            return "ibug51" if self.published else "mediapipe"
-        return self.landmarks
+        return self.landmarks if self.landmarks != "auto" else "ibug51" if self.published else "mediapipe"
 
     def in_effect(self) -> "TrackingSettings":
         """The settings that a tracking depends on: those that its schedule does not use have the same values always."""
@@ -149,6 +147,4 @@ class ScoringSettings:
 
     def cut_after(self, tracking: TrackingSettings) -> Cut:
         """The cut of sequences that were tracked with these settings."""
-        if self.cut == "auto":
-            return "line" if tracking.published else "plane"
-        return self.cut
+        return self.cut if self.cut != "auto" else "line" if tracking.published else "plane"

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mien.adam import Moments
 from mien.face.params import most_frontal_camera
@@ -118,11 +119,32 @@ def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: Phot
 
 def fit_appearance(descent: Descent) -> None:
     """Fit texture and light again, all else fixed, to frames spread over the sequences, in random order."""
-    chosen = some_frames(descent)
-    moments: dict[str, Moments] = {}
+    chosen, moments, weights = some_frames(descent), {}, descent.trusted()
     order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), 6))  # steps at each
     for number, index in enumerate(order):
-        _step_appearance(descent, descent.targets(*chosen[index]), moments, _fading(number, len(order)))
+        targets = descent.targets(*chosen[index])
+        moving, leaves = descent.moving(targets[0], ("texture", "light"))
+        vertices = pose_vertices(descent.scene, moving)
+        colors = [color_term(descent.scene, one, moving, vertices, weights) for one in targets]
+        gradients = _gradients(torch.stack(colors).mean() + light_term(moving.light), leaves)
+        _step(descent, targets[0].sequence, gradients, moments, _fading(number, len(order)))
+
+
+def _gradients(cost: Tensor, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    return dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values())), strict=True))
+
+
+@torch.no_grad()
+def _step(
+    descent: Descent, sequence: int, gradients: dict[str, Tensor], moments: dict[str, Moments], rate: float
+) -> None:
+    """Move parameters that frames share, and the light of a sequence, by Adam."""
+    for name, gradient in gradients.items():
+        light = name == "light"
+        values = descent.state.lights[sequence] if light else getattr(descent.state, name)
+        own = moments.setdefault(f"light_{sequence}" if light else name, Moments.zeros(values))
+        whole = gradient + roughness_gradient(values) if name == "texture" else gradient
+        apply_adam(own, values, whole, rate * RATES["lights" if light else name])
 
 
 def measure_visibility(descent: Descent, places: Sequence[tuple[int, int]]) -> None:
@@ -141,22 +163,6 @@ def some_frames(descent: Descent) -> list[tuple[int, int]]:
         several = torch.linspace(0, len(rows) - 1, count).round().long().unique()
         chosen += [(sequence, row) for row in several.tolist()]
     return chosen
-
-
-def _step_appearance(descent: Descent, targets: Sequence[Target], moments: dict[str, Moments], rate: float) -> None:
-    scene, state, target = descent.scene, descent.state, targets[0]
-    moving, leaves = descent.moving(target, ("texture", "light"))
-    vertices = pose_vertices(scene, moving)
-    colors = [color_term(scene, one, moving, vertices, descent.trusted()) for one in targets]
-    loss = torch.stack(colors).mean() + light_term(moving.light)
-    by_texture, by_light = torch.autograd.grad(loss, list(leaves.values()))
-    light = state.lights[target.sequence]
-    with torch.no_grad():
-        by_texture += roughness_gradient(state.texture)
-        of_texture = moments.setdefault("texture", Moments.zeros(by_texture))
-        apply_adam(of_texture, state.texture, by_texture, rate * RATES["texture"])
-        of_light = moments.setdefault(f"light_{target.sequence}", Moments.zeros(light))
-        apply_adam(of_light, light, by_light, rate * RATES["lights"])
 
 
 def fit_sequence(descent: Descent, sequence: int, advance: Advance, cache: StageCache) -> None:
@@ -194,7 +200,7 @@ def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -
     """Fit the first frame of a sequence. The very first one has turns until its cost no longer falls."""
     settings = descent.scene.settings
     if not first_of_all:
-        turn_of_first(descent, targets, settings.first_steps // 5, appearance_first=True, shared=())
+        turn_of_first(descent, targets, settings.first_steps // 5, appearance_first=True)
         return
     face = face_of(descent.scene, descent.moving(targets[0], ())[0])
     cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
@@ -205,36 +211,23 @@ def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -
         before, cost = cost, turn_of_first(descent, targets, settings.first_steps, appearance_first=False)
 
 
-def turn_of_first(
-    descent: Descent,
-    targets: Sequence[Target],
-    steps: int,
-    appearance_first: bool,
-    shared: Sequence[str] = ("identity", "offsets", "log_focals"),
-) -> float:
-    """Fit a first frame, its texture and light, and those shared parameters.
+def turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appearance_first: bool) -> float:
+    """Fit all parameters to a first frame, and return the mean cost of the last tenth of the steps.
 
-    Returns the mean cost of the last tenth of the steps. With `appearance_first`, only texture and light move in the
-    first half of them.
+    With `appearance_first`, only texture and light move in the first half of them.
     """
-    scene, state, target, costs = descent.scene, descent.state, targets[0], []
-    values = {name: getattr(state, name) for name in ("texture", *shared) if getattr(state, name).numel()}
-    values["light"] = state.lights[target.sequence]
-    moments = {name: Moments.zeros(value) for name, value in values.items()}
+    scene, target, costs, moments = descent.scene, targets[0], [], {}
+    lenses = ("log_focals",) if len(descent.state.log_focals) else ()
     stepper = descent.stepper(target.sequence, target.row, smoothness=0.0)
     for step in range(steps):
-        rate = _fading(step, steps)
-        names = ("texture", "light") if appearance_first and 2 * step < steps else ("row", *values)
-        moving, leaves = descent.moving(target, names)
-        loss = descent.frame_cost(targets, moving, scene.used, None) + shared_terms(scene, moving, [moving.light])
-        gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
-        costs.append(float(loss.detach()))
-        with torch.no_grad():
-            gradients["texture"] = gradients["texture"] + roughness_gradient(moving.texture)
-            if "row" in leaves:
-                stepper.step(gradients.pop("row"), rate * RATES["row"])
-            for name, gradient in gradients.items():
-                apply_adam(moments[name], values[name], gradient, rate * RATES.get(name, RATES["lights"]))
+        names = () if appearance_first and 2 * step < steps else ("row", "identity", "offsets", *lenses)
+        moving, leaves = descent.moving(target, ("texture", "light", *names))
+        cost = descent.frame_cost(targets, moving, scene.used, None) + shared_terms(scene, moving, [moving.light])
+        gradients, rate = _gradients(cost, leaves), _fading(step, steps)
+        costs.append(float(cost.detach()))
+        if names:
+            stepper.step(gradients.pop("row"), rate * RATES["row"])
+        _step(descent, target.sequence, gradients, moments, rate)
     last = costs[-max(1, steps // 10) :]
     return sum(last) / max(len(last), 1)
 
@@ -249,9 +242,8 @@ def fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
         moving, leaves = descent.moving(targets[0], ("row",))
         if step % 10 == 0:  # number of a frame's steps between estimates of the unexplained light in its pictures
             even = [without_smooth_difference(descent.scene, target, moving, weights) for target in targets]
-        loss = descent.frame_cost(even, moving, weights, around, smoothness)
-        (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-        stepper.step(gradient, RATES["row"] * _fading(step, steps))
+        gradients = _gradients(descent.frame_cost(even, moving, weights, around, smoothness), leaves)
+        stepper.step(gradients["row"], RATES["row"] * _fading(step, steps))
 
 
 def _fading(step: int, steps: int) -> float:

@@ -164,9 +164,7 @@ def smoothness_term(
     return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
 
 
-def shared_terms(
-    scene: PaperScene, state: PaperState | Moving, lights: Iterable[Float[Tensor, "9 3"]]
-) -> Float[Tensor, ""]:
+def shared_terms(scene: PaperScene, state: PaperState | Moving, lights: Iterable[Tensor]) -> Float[Tensor, ""]:
     """The prior costs of identity, offsets, focal lengths and these lights."""
     total = ((state.identity - scene.identity) / 0.5).square().sum()  # in standard deviations of the identity's prior
     total = total + (state.log_focals / 0.03).square().sum()  # the focal length stays near that of the start
