@@ -28,7 +28,7 @@ from mien.face import FaceModel, FaceParams
 from mien.pipeline.drive import open_driver
 from mien.pipeline.names import check_neutral
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
-from mien.tracking import read_tracking
+from mien.tracking import read_tracking, write_tracking
 from mien.training import TrainSettings, train
 from mien.training.alignment import align, align_faces, descend, steadier
 from mien.training.settings import AlignmentSettings
@@ -231,6 +231,18 @@ def test_the_command_aligns_once_and_always_from_the_tracking(workspace: Path, c
     assert "before_alignment.safetensors" in told
     shutil.rmtree(tracked)
     assert "run `mien track" in run(code=2)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize(("preset", "aligned", "tells"), [
+    ("paper", True, True), ("paper", False, False), ("draft", True, False),
+])  # fmt: skip
+def test_a_run_as_published_says_that_its_frames_were_aligned(workspace, capsys, preset, aligned, tells) -> None:
+    folder = workspace / "sequences/clip/tracking"
+    write_tracking(folder, replace(read_tracking(folder), settings={"aligned": {"iterations": 2}} if aligned else {}))
+    assert main(["train", str(workspace), "--run", "other", "--preset", preset, "--steps", "2"]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "clip: frames were aligned to a quick" in line]
+    assert len(told) == tells
 
 
 def test_wrong_options_are_one_line(workspace: Path, capsys) -> None:

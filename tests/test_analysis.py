@@ -21,9 +21,11 @@ from damage import edit_json
 from mien.avatar import load_avatar
 from mien.cli import main
 from mien.disk.files import write_tensors
+from mien.errors import UserError
 from mien.face import FaceModel
+from mien.face.loading import add_face_model, load_face_model, without_teeth
 from mien.lab.analysis import gaussian_avatars, measuring
-from mien.lab.analysis.gaussian_avatars import jaw_opening, open_jaw, without_teeth
+from mien.lab.analysis.gaussian_avatars import jaw_opening, open_jaw
 from mien.lab.analysis.registry import ANALYSES
 from mien.lab.analysis.result import Chart, Result, Table
 from mien.machine import devices
@@ -214,6 +216,23 @@ def test_a_run_without_teeth_says_so(made_once: MadeOnce, tmp_path: Path) -> Non
     workspace = Path(shutil.copytree(toy_workspace(made_once), tmp_path / "W"))
     parts = analyze(workspace, "--parts", "teeth", "teeth-trained")["parts"]
     assert all("no triangles of teeth" in parts[name]["findings"][0] for name in ("teeth", "teeth-trained"))
+
+
+def test_teeth_are_compared_without_a_copy_of_a_face_model_that_may_not_be_shared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(toy_scene, "toy_face_model", lambda: replace(toy_with_teeth(), shareable=False))
+    add_face_model(toy_scene.toy_face_model(), tmp_path / "toy.npz", "0" * 64)
+    write_toy_workspace(tmp_path / "W")
+    part = analyze(tmp_path / "W", "--parts", "teeth-trained", "--steps", "2")["parts"]["teeth-trained"]
+    assert [row["mouth_psnr"] > 0 for row in part["values"]["rows"]] == [True, True]
+    trained = {load_avatar(path).face_model.name for path in (tmp_path / "W/analysis/toy/runs").iterdir()}
+    assert trained == {"toy", "toy-no-teeth"}
+    assert not [path for path in tmp_path.glob("W/**/*") if path.stem == "face_model"], "nothing is written out"
+    for name in ("toy-no-teeth-no-teeth", "none-no-teeth"):
+        with pytest.raises(UserError, match="there is no face model"):
+            load_face_model(name)
 
 
 def part_of_dots(_: Any) -> Result:

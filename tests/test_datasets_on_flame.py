@@ -20,6 +20,7 @@ from mien.datasets.writing import write_sequence
 from mien.face import FaceModel
 from mien.face.models import teeth
 from mien.face.models.flame import flame_face_model, read_flame
+from mien.tracking.landmarks.regions import with_regions_by_landmarks
 from mien.training.footage.clothes import clothes_mask
 from mien.training.settings.splits import OwnSplit
 from refusals import refuses
@@ -216,6 +217,9 @@ def test_vhap_with_teeth(scene: Scene, tmp_path: Path, monkeypatch: pytest.Monke
         "posedirs": np.moveaxis(grown.correctives, 0, 2),
     }  # fmt: skip
     model = replace(flame_face_model(grown, "flame"), landmarks=scene.model.landmarks)
+    by_marks = with_regions_by_landmarks(model)
+    assert {"lips", "mouth"} <= set(by_marks.region_names)
+    assert by_marks.region_mask("teeth").nonzero()[:, 0].tolist() == list(range(len(file.faces), len(grown.faces)))
     person = replace(scene, arrays=arrays, model=model, colors=torch.full(grown.template.shape, 0.7))
     folder = layouts.write_offset(tmp_path / "me", person)
     checks.check_import(checks.read(folder, "vhap", model), layouts.TRACKED["vhap, static offsets"], person)

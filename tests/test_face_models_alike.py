@@ -338,7 +338,7 @@ def test_from_pixels_to_an_avatar_that_is_not_passed_on(added, capture, tmp_path
         expected = avatar.pose(face).gaussians.timestep(0)
     np.testing.assert_allclose(posed.means, expected.means.numpy(), atol=2e-6)
     # The paper's schedule takes the model too.
-    paper = PaperSettings(first_steps=4, steps=1, epochs=1, texture_size=64)
+    paper = PaperSettings("fast", first_steps=4, steps=1, epochs=1, texture_size=64)
     pixels = PhotometricSettings(sizes=(64,), texture_size=64, shared_steps=1, keyframes=4)
     settings = TrackingSettings(schedule="paper", paper=paper, keyframes=4, photometric=pixels)
     tracking = track(capture, load_face_model("my_head"), settings)

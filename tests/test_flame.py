@@ -222,5 +222,8 @@ def test_flame_with_teeth() -> None:
         assert not array[..., 5023:, :].any()
     ring = (flame.identity[:, 1713] + flame.identity[:, 1576]) / 2
     assert np.allclose(found.identity[:, 5023 + 15 * np.arange(8)], ring[:, None])
+    taught = flame_face_model(found, "flame").region_mask("teeth")
+    assert taught.nonzero()[:, 0].tolist() == list(range(9976, 10144))
+    assert "teeth" not in flame_face_model(flame, "flame").region_names
     with pytest.raises(UserError, match=r"m.npz: has 5,024 vertices and 9,976 triangles, and teeth belong to FLAME's"):
         with_teeth(like_flame(5024), "m.npz")

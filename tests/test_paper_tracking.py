@@ -19,16 +19,17 @@ from mien.tracking.fitting.fit import Fit, SequenceFit, widen
 from mien.tracking.fitting.parameters import layout_of
 from mien.tracking.fitting.resume import StageCache
 from mien.tracking.fitting.sequence import sequence_data
+from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS, landmark_weights
 from mien.tracking.landmarks.model import reduce_face_model
 from mien.tracking.landmarks.problem import Problem, lenses_of
 from mien.tracking.landmarks.term import all_landmarks, quiet_landmarks, unknown_subject
-from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
+from mien.tracking.settings import PaperSettings, PhotometricSettings, ScoringSettings, TrackingSettings
 from photometric_case import FOCAL, PhotometricCase, assert_alike, make_photometric_case
 from test_photometric_tracking import turn_error, wobble
 
 PIXELS = PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1)
 LANDMARKS = TrackingSettings(focal=FOCAL, schedule="landmarks", photometric=PIXELS)
-QUICK = PaperSettings(texture_size=64, first_steps=60, steps=15, epochs=3)
+QUICK = PaperSettings(start="fast", texture_size=64, first_steps=60, steps=15, epochs=3)
 PAPER = replace(LANDMARKS, schedule="paper", paper=QUICK)
 ALONE = replace(PAPER, paper=replace(QUICK, start="landmarks"))
 
@@ -57,7 +58,8 @@ def _descent(case: PhotometricCase, settings: TrackingSettings) -> Descent:
 
 @pytest.mark.unchecked
 def test_pixels_calm_what_landmarks_leave(case):
-    by_landmarks, by_descent, alone = (track(case.capture, case.model, each) for each in (LANDMARKS, PAPER, ALONE))
+    longer = replace(ALONE, paper=replace(ALONE.paper, steps=50, epochs=10))  # many steps follow from the frame before
+    by_landmarks, by_descent, alone = (track(case.capture, case.model, each) for each in (LANDMARKS, PAPER, longer))
     for found in (by_descent, alone):
         assert wobble(case, found) < 0.25 * wobble(case, by_landmarks)
         assert found.pixel_residuals is not None
@@ -82,11 +84,46 @@ def test_the_first_frame_has_turns_until_it_no_longer_gets_better(case, monkeypa
     assert costs == [100.0, 90.0, 80.0, 79.5]
 
 
-def test_a_turn_of_the_first_frame_lowers_its_cost(case):
-    descent = _descent(case, ALONE)
-    targets = descent.targets(0, 0)
-    first = frames.turn_of_first(descent, targets, 20, appearance_first=True)
-    assert frames.turn_of_first(descent, targets, 20, appearance_first=False) < first
+def test_all_parameters_are_fitted_to_the_first_frame(case):
+    descent = _descent(case, replace(ALONE, focal=None))
+    before = {name: tensor.clone() for name, tensor in descent.state.tensors().items()}
+    target = descent.targets(0, 0)
+    first, last = (frames.turn_of_first(descent, target, 20, appearance_first=on) for on in (True, False))
+    assert last < first
+    changed = {name for name, tensor in descent.state.tensors().items() if not tensor.equal(before[name])}
+    assert changed == {"identity", "offsets", "texture", "lights", "log_focals", "frames_0"}
+    assert descent.state.frames[0][1:].equal(before["frames_0"][1:])
+
+
+def test_each_next_frame_starts_from_the_one_before(case, monkeypatch):
+    descent, begun = _descent(case, ALONE), []
+    rows = descent.state.frames[0]
+
+    def fit(_: Descent, targets: list, steps: int) -> None:
+        begun.append((steps, targets[0].row, rows[targets[0].row].clone()))
+        rows[targets[0].row] += 1e-4
+
+    monkeypatch.setattr(frames, "fit_first", lambda *_, **__: None)
+    monkeypatch.setattr(frames, "fit_row", fit)
+    monkeypatch.setattr(frames, "visibility_of", lambda scene, *_: scene.used)
+    frames.fit_sequence(descent, 0, lambda *_, **__: None, StageCache(None))
+    assert [(steps, row) for steps, row, _ in begun] == [(QUICK.steps, row) for row in range(1, len(rows))]
+    assert all(start.equal(rows[row - 1]) for _, row, start in begun if (0, row - 1) not in descent.lost)
+    assert len(descent.lost) < 2
+
+
+def test_offsets_are_on_every_vertex_and_their_laplacian_counts(case):
+    """One vertex that stands out costs its own distance from the mean of its neighbours, and each neighbour's."""
+    model = replace(case.model, region_names=("scalp",), face_regions=torch.zeros(len(case.model.faces)).long())
+    shares = [scene_of(replace(case, model=model), settings)[0].offset_share for settings in (ALONE, PAPER)]
+    assert [set(share.flatten().tolist()) for share in shares] == [{1.0}, {0.0}]
+    scene, offsets = scene_of(case, ALONE)[0], torch.zeros_like(case.model.template)
+    assert float(terms.offset_term(scene, offsets)) == 0
+    near = [set(case.model.faces[(case.model.faces == v).any(1)].flatten().tolist()) - {v} for v in range(len(offsets))]
+    offsets[7] = torch.tensor([0.0, 0.003, 0.004])
+    laplacian = 0.005**2 * (1 + sum(1 / len(near[v]) ** 2 for v in near[7]))
+    expected = (0.005**2 / 0.002**2 + laplacian / 0.0001**2) / 100
+    assert float(terms.offset_term(scene, offsets)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_first_texture_is_from_the_most_frontal_camera(case, monkeypatch):
@@ -141,17 +178,22 @@ def test_smoothness_in_the_frame_pass_is_a_setting(case):
         descent = _descent(case, replace(PAPER, paper=replace(QUICK, pass_smoothness=smoothness)))
         rows = descent.state.frames[0]
         rows[3] = descent.bounds.clip(rows[3] + 0.02)
-        frames.fit_row(descent, descent.targets(0, 3), 10)
+        frames.fit_row(descent, descent.targets(0, 3), 50)
         ends[smoothness] = rows[3].clone()
-    steady = (_descent(case, LANDMARKS).state.frames[0][[2, 4]]).mean(0)
+    steady = 2 * rows[2] - rows[1]
     alone, smooth = (float((end - steady)[:3].norm()) for end in ends.values())
     assert smooth < 0.5 * alone
 
 
-def test_defaults_are_the_supplements():
-    """All but the temporal term while frames are fitted one after the other, which is worse (docs/log.md)."""
-    assert (PaperSettings().steps, PaperSettings().epochs) == (50, 30)
-    assert PaperSettings().pass_smoothness == 0
+def test_the_schedule_alone_is_the_supplements():
+    alone, better = TrackingSettings(schedule="paper"), TrackingSettings(schedule="paper", paper=QUICK)
+    assert (alone.paper.start, alone.paper.steps, alone.paper.epochs) == ("landmarks", 50, 30)
+    assert alone.paper.pass_smoothness > 0
+    found = [(one.landmark_set, ScoringSettings().cut_after(one)) for one in (alone, better, TrackingSettings())]
+    assert found == [("ibug51", "line"), ("mediapipe", "plane"), ("mediapipe", "plane")]
+    assert int((landmark_weights(alone.landmark_set) > 0).sum()) == 51 + len(LEFT_IRIS + RIGHT_IRIS)
+    given = replace(alone, landmarks="mediapipe"), ScoringSettings("plane")
+    assert (given[0].landmark_set, given[1].cut_after(given[0])) == ("mediapipe", "plane")
 
 
 def test_the_neck_has_no_column_of_its_own(case):

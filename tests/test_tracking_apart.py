@@ -40,8 +40,8 @@ LANDMARKS = TrackingSettings(schedule="landmarks")
 FAST = replace(
     LANDMARKS, schedule="fast", photometric=PhotometricSettings(texture_size=64, keyframes=4, shared_steps=1)
 )
-PAPER = replace(FAST, schedule="paper", paper=PaperSettings(texture_size=64, epochs=2))
-PAPER_ALONE = replace(PAPER, paper=replace(PAPER.paper, start="landmarks", first_steps=30, steps=8))
+PAPER = replace(FAST, schedule="paper", paper=PaperSettings("fast", texture_size=64, epochs=2))
+PAPER_ALONE = replace(PAPER, paper=replace(PAPER.paper, start="landmarks", first_steps=30, steps=25))
 SCHEDULES = {"landmarks": LANDMARKS, "fast": FAST, "paper": PAPER, "paper from landmarks": PAPER_ALONE}
 
 

@@ -15,10 +15,9 @@ from mien.disk.files import read_json, read_tensors, write_tensors
 from mien.errors import UserError
 from mien.tracking import read_tracking, scoring_files, write_tracking
 from mien.tracking.neck_cut import NeckParts, above_neck_cut, fit_neck_cut
-from mien.tracking.neck_line import bottom_vertices, fit_neck_lines
+from mien.tracking.neck_line import bottom_vertices, fit_neck_lines, project_neck_line
 from mien.tracking.report.overlay import OverlayPainter, write_overlay
 from mien.tracking.scoring import Scoring, cut_matte, head_crop, make_scoring
-from mien.tracking.settings import ScoringSettings
 from mien.tracking.tracking import Appearance, Tracking
 from refusals import refuses
 from small_face_model import make_small_face_model
@@ -61,6 +60,24 @@ def test_neck_line_of_an_upright_head():
     twice = {name: getattr(model, name).repeat_interleave(2, 0) for name in ("faces", "uv_faces", "face_regions")}
     with pytest.raises(AssertionError, match="closed"):
         bottom_vertices(replace(model, **twice))
+
+
+def test_the_neck_line_is_one_line_in_space_that_every_camera_projects():
+    """The base of this neck is deeper than wide, so a line fitted in a picture from above would run along the neck."""
+    model, face = _upright(roll=0.2)
+    bottom, head = model(face)[0, bottom_vertices(model)], face.T_world_head[0]
+    center, sideways, up = torch.tensor([0.0, 0.0, -0.9]), torch.tensor([0.0, 1.0, 0.0]), head[:3, 1]
+    for away in ((0.0, 0.2, 1.0), (0.5, 0.8, 0.6), (-0.6, -0.3, 0.8), (0.2, 0.3, -1.0)):
+        camera = replace(CAMERA, viewmat=look_at(center + torch.tensor(away), center, sideways))
+        line = project_neck_line(bottom, head, camera)
+        points = bottom.mean(0) + torch.tensor([[-0.1], [0.0], [0.1]]) * head[:3, 0]
+        pixels = camera.project(torch.cat([points, points + 0.1 * up]))[0]
+        heights = pixels @ line[:2] + line[2]
+        assert heights[:3].abs().max() < 0.05, away
+        assert heights[3:].min() > 10, "the head is above it"
+    for away in ((1.0, 0.2, 0.0), (-1.0, 0.0, 0.0), (1.0, 0.5, 0.1)):
+        side = replace(CAMERA, viewmat=look_at(center + torch.tensor(away), center, sideways))
+        assert abs(float(project_neck_line(bottom, head, side)[0])) < 0.3, "level, where the line would run upwards"
 
 
 def _ring(height: float, radii: tuple[float, float] = (0.06, 0.05)) -> torch.Tensor:
@@ -137,8 +154,11 @@ def test_scoring_keeps_what_is_above_the_line_of_each_picture_and_nothing_else()
     # `line` is the supplement's mask: a straight line in the picture, and no exception for what is below it.
     model, face = _upright(2, roll=0.5)
     tracking, capture = _tracking(model, face), capture_of(torch.full((2, 478, 2), 100.0))
-    scoring = make_scoring(capture, tracking, model, settings=ScoringSettings("line"))
-    a, b, d = tracking.neck_lines[1, 0].double().numpy()
+    scoring = make_scoring(capture, tracking, model, cut="line")
+    bottom, across = model(face)[1, bottom_vertices(model)].mean(0), 0.05 * face.T_world_head[1, :3, 0]
+    (x, y), (right, down) = CAMERA.project(torch.stack([bottom - across, bottom + across]))[0].double().numpy()
+    a, b = (down - y, x - right) / np.hypot(right - x, down - y)
+    d = -a * x - b * y
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
     above = a * columns + b * rows + d
     assert abs(a) > 0.2, "the head is tilted, and so is the line"
@@ -238,14 +258,14 @@ def test_scoring_round_trip_and_frozen(tmp_path):
 
 def test_masks_keep_their_cut(tmp_path):
     folder = tmp_path / "scoring"
-    scoring_files.check_scoring_cut(folder, ScoringSettings("line"), "a1")
+    scoring_files.check_scoring_cut(folder, "line", "a1")
     scoring_files.write_scoring(folder, replace(_scoring(), cut="line"), "a1")
     assert read_json(folder / "scoring.json", "mien.scoring", 1, "")["cut"] == "line"
     assert scoring_files.read_scoring(folder).cut == "line"
-    scoring_files.check_scoring_cut(folder, ScoringSettings("line"), "a1")
-    scoring_files.check_scoring_cut(folder, ScoringSettings("plane"), "b2")  # masks of other pictures are made again
+    scoring_files.check_scoring_cut(folder, "line", "a1")
+    scoring_files.check_scoring_cut(folder, "plane", "b2")  # masks of other pictures are made again
     with pytest.raises(UserError, match=r"--scoring.cut plane: .*give --scoring.cut line, or delete that folder"):
-        scoring_files.check_scoring_cut(folder, ScoringSettings("plane"), "a1")
+        scoring_files.check_scoring_cut(folder, "plane", "a1")
     edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
     refuses(r"cut 'circle' is neither plane nor line; delete the folder", scoring_files.read_scoring, folder)
 

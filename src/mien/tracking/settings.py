@@ -12,7 +12,9 @@ _FOCALS = (10.0, 1e6)
 _DEVIATION = Range(5e-324, math.inf, words="a number above 0, or inf for none")
 
 LandmarkSet = Literal["mediapipe", "ibug51"]
-"""All 478 landmarks, or the 68 of 300-W without their contour (supplement of GaussianAvatars, section A) and irises."""
+"""All 478 landmarks, or irises and the 68 of 300-W without their contour (supplement of GaussianAvatars, section A)."""
+Cut = Literal["plane", "line"]
+"""Lower end of the head in scoring masks."""
 _TEXELS = Range(16, 8192)
 """Allowed number of texels along a side of a texture."""
 
@@ -57,21 +59,20 @@ class PhotometricSettings:
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """Tracking by gradient descent as in the supplement of GaussianAvatars (section A), from a better start."""
+    """Tracking by gradient descent as in the supplement of GaussianAvatars (section A), or from a better start."""
 
-    start: Literal["fast", "landmarks"] = "fast"
-    """Start of the fit. fast: the global epochs start from the result of the schedule `fast`, which is better and
-    quicker. landmarks: as in the supplement, the first frame is fitted to convergence, then each next frame from the
-    one before it, then the epochs run."""
+    start: Literal["landmarks", "fast"] = "landmarks"
+    """Start of the fit. landmarks: as in the supplement, all parameters are fitted to the first frame, then each next
+    frame from the one before it, then the epochs run, with offsets on all vertices. fast: the epochs start from the
+    result of the schedule `fast`, and what pictures do not show has no offsets, which is better and quicker."""
     first_steps: Annotated[int, COUNT_OR_NONE] = 500
     """Optimiser steps of a turn at the first frame, half of those of the first turn for texture and light alone. Turns
     follow until the cost falls by less than a hundredth. Only with start `landmarks`."""
     steps: Annotated[int, COUNT_OR_NONE] = 50
-    """Optimiser steps for each next frame, which starts from the frame before it. Only with start `landmarks`."""
-    pass_smoothness: Annotated[float, NOT_NEGATIVE] = 0.0
-    """Weight of the smoothness of motion while frames are fitted one after the other; the epochs have all of it. 1 is
-    the supplement's temporal term. Only with start `landmarks`. With 1, motion errs more on drawn frames: 0.17 instead
-    of 0.08 degrees of rotation."""
+    """Optimiser steps for each next frame. Only with start `landmarks`."""
+    pass_smoothness: Annotated[float, NOT_NEGATIVE] = 0.01
+    """Weight of the smoothness of motion while each frame is fitted from those before it; 0 leaves it out. The epochs
+    have all of it, but with 1 here, 16 drawn frames drift by 23 instead of 6 mm. Only with start `landmarks`."""
     epochs: Annotated[int, COUNT_OR_NONE] = 30
     """Passes over all frames in random order that refine everything."""
     texture_size: Annotated[int, _TEXELS] = 512
@@ -88,9 +89,10 @@ class TrackingSettings:
     little, because landmarks of a face hardly determine it. Calibrated cameras keep their own."""
     same_camera: bool = False
     """State that all sequences were filmed with the same camera and zoom, so that they share one focal length."""
-    landmarks: LandmarkSet = "mediapipe"
+    landmarks: Literal["auto", "mediapipe", "ibug51"] = "auto"
     """The landmarks that count: all 478 of MediaPipe, or, as in GaussianAvatars, the 68 of 300-W without their 17
-    contour points. Irises always count, for the gaze."""
+    contour points. Irises always count, for the gaze. auto: ibug51 for the schedule `paper` from landmarks, else
+    mediapipe."""
     keyframes: Annotated[int, COUNT] = 20
     """Frames of each sequence from which identity is fitted. They are chosen for different head poses."""
     identity_weight: Annotated[float, NOT_NEGATIVE] = 4.0
@@ -99,8 +101,7 @@ class TrackingSettings:
     """Smoothness over time."""
     schedule: Literal["landmarks", "fast", "paper"] = "fast"
     """Stages of the fit. landmarks: fit landmarks alone. fast: then fit pixels, with one texture for all pictures.
-    paper: then refine everything by gradient descent over frames in random order (GaussianAvatars), which takes many
-    times longer."""
+    paper: gradient descent as in the supplement of GaussianAvatars, which takes many times longer and is worse."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     """The fit to pixels of the schedule `fast`."""
     paper: PaperSettings = field(default_factory=PaperSettings)
@@ -116,19 +117,34 @@ class TrackingSettings:
             )
         check_ranges(self, lambda name: f"--tracking.{name.replace('_', '-')}")
 
+    @property
+    def published(self) -> bool:
+        """Whether the fit is the supplement's, from landmarks on."""
+        return self.schedule == "paper" and self.paper.start == "landmarks"
+
+    @property
+    def landmark_set(self) -> LandmarkSet:
+        """The landmarks that count."""
+        return self.landmarks if self.landmarks != "auto" else "ibug51" if self.published else "mediapipe"
+
     def in_effect(self) -> "TrackingSettings":
-        """The settings that a tracking depends on: those that its schedule does not use are at their defaults."""
-        paper = self.paper if self.schedule == "paper" else PaperSettings()
-        by_pixels = self.schedule == "fast" or (self.schedule == "paper" and paper.start == "fast")
-        return replace(self, paper=paper, photometric=self.photometric if by_pixels else PhotometricSettings())
+        """The settings that a tracking depends on: those that its schedule does not use have the same values always."""
+        paper = self.paper if self.schedule == "paper" else PaperSettings("fast", pass_smoothness=0.0)
+        by_pixels = self.schedule != "landmarks" and not self.published
+        photometric = self.photometric if by_pixels else PhotometricSettings()
+        return replace(self, landmarks=self.landmark_set, paper=paper, photometric=photometric)
 
 
 @dataclass(frozen=True)
 class ScoringSettings:
     """Settings of the scoring mask: what is trained on and scored."""
 
-    cut: Literal["plane", "line"] = "plane"
+    cut: Literal["auto", "plane", "line"] = "auto"
     """Lower end of the head in the masks. plane: a plane across the lower neck, which all cameras see alike; the
-    projected head stays whole. line: as in the supplement of GaussianAvatars, a straight line in each picture along the
-    base of the neck, below which everything goes; for figures beside those of that protocol. Masks are written once,
-    so a sequence keeps its cut."""
+    projected head stays whole. line: as in the supplement of GaussianAvatars, a line in space across the base of the
+    neck, below which everything goes; for figures beside those of that protocol. auto: line for the tracking schedule
+    `paper` from landmarks, else plane. Masks are written once, so a sequence keeps its cut."""
+
+    def cut_after(self, tracking: TrackingSettings) -> Cut:
+        """The cut of sequences that were tracked with these settings."""
+        return self.cut if self.cut != "auto" else "line" if tracking.published else "plane"

@@ -35,7 +35,7 @@ from mien.face.models.schema import (
 )
 
 REGIONS = ("skin", "neck", "eyes", "irises")
-"""Regions that follow from skinning weights. `mien.tracking.landmarks` finds more, by landmarks."""
+"""Regions that follow from skinning weights, beside `teeth`. `mien.tracking.landmarks` finds more, by landmarks."""
 
 _CHAIN = (-1, 0, 1, 1, 1)  # parents in FLAME's chain: the root, the neck on it, jaw and eyes on the neck
 _TURNED = (1, 2, 3, 4)  # FLAME's joints about which mien's neck, jaw and eyes turn
@@ -65,6 +65,8 @@ class FlameFile:
     uv: Float[np.ndarray, "u 2"] | None
     """Texture coordinates, v upwards."""
     uv_faces: Int[np.ndarray, "f 3"] | None
+    teeth: int = 0
+    """Number of triangles of teeth, which are the last (`with_teeth`)."""
 
 
 def read_flame(path: Path) -> FlameFile:
@@ -111,7 +113,7 @@ def flame_face_model(flame: FlameFile, name: str, shareable: bool = False) -> Fa
         faces=torch.from_numpy(flame.faces),
         uv=rounded(uv),
         uv_faces=torch.from_numpy(uv_faces),
-        region_names=REGIONS,
+        region_names=(*REGIONS, "teeth") if flame.teeth else REGIONS,
         face_regions=torch.from_numpy(_regions(flame, eyes, centers)),
         identity_basis=float_tensor(flame.identity),
         expression_basis=float_tensor(flame.expression),
@@ -178,6 +180,7 @@ def _skeleton(flame: FlameFile, origin: Float[np.ndarray, " 3"]) -> dict[str, An
 
 def _regions(flame: FlameFile, eyes: list[np.ndarray], centers: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " f"]:
     regions = np.zeros(len(flame.faces), np.int64)
+    regions[len(regions) - flame.teeth :] = len(REGIONS)
     regions[(flame.weights[:, 0] > 0.5)[flame.faces].all(1)] = REGIONS.index("neck")
     for ball, center in zip(eyes, centers, strict=True):
         triangles = ball[flame.faces].all(1)

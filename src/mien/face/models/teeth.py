@@ -69,6 +69,7 @@ def with_teeth(flame: FlameFile, name: str) -> FlameFile:
         weights=np.concatenate([flame.weights, weights]),
         uv=uv,
         uv_faces=uv_faces,
+        teeth=len(tooth_triangles()),
     )
 
 

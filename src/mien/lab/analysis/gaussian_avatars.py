@@ -15,6 +15,7 @@ from mien.camera import Box
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
+from mien.face.loading import without_teeth
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.analysis import measuring
@@ -229,9 +230,6 @@ def teeth_trained(context: Context) -> Result:
     model, config = context.avatar.face_model, context.avatar.config
     if not bool(model.region_mask("teeth").any()):
         return Result({"teeth_triangles": 0}, [_NO_TEETH])
-    if not model.shareable:
-        told = f"The licence of the face model {model.name} allows no copy without teeth, so nothing was trained."
-        return Result({"trained": False}, [told])
     context.say_how_long("teeth-trained", 2)
     runs = [context.train("teeth-on", config), context.train("teeth-off", config, without_teeth(model))]
     rows = []
@@ -260,23 +258,6 @@ def teeth_trained(context: Context) -> Result:
             "Both trainings have the same settings, seed and frames.",
             f"{context.options.steps:,} steps are a short training; all schedules are shortened with it.",
         ],
-    )
-
-
-def without_teeth(model: FaceModel) -> FaceModel:
-    """The face model without the triangles of teeth. Its vertices stay."""
-    kept = ~model.region_mask("teeth")
-    place = torch.cumsum(kept.long(), 0) - 1
-    landmarks = {
-        name: replace(points, faces=place[points.faces].clamp_min(0)) for name, points in model.landmarks.items()
-    }
-    return replace(
-        model,
-        name=f"{model.name}-no-teeth",
-        faces=model.faces[kept],
-        uv_faces=model.uv_faces[kept],
-        face_regions=model.face_regions[kept],
-        landmarks=landmarks,
     )
 
 

@@ -181,7 +181,8 @@ class Descent:
         """Move the shared parameters by a batch's summed gradients and its share of the priors' gradients."""
         leaves = {name: getattr(self.state, name).clone().requires_grad_() for name in gradients}
         with torch.enable_grad():
-            cost = shared_terms(self.scene, replace(self.state, **leaves))
+            state = replace(self.state, **leaves)
+            cost = shared_terms(self.scene, state, state.lights)
             by_prior = torch.autograd.grad(cost, list(leaves.values()))
         for (name, gradient), beforehand in zip(gradients.items(), by_prior, strict=True):
             mean = gradient / frames + share * beforehand

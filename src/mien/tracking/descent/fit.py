@@ -1,4 +1,4 @@
-"""The `paper` schedule: gradient descent over all frames in random order, which starts from the result of `fast`."""
+"""The `paper` schedule: the first frame, then each next one, then gradient descent over all frames in random order."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from mien.adam import Moments
@@ -25,6 +24,7 @@ from mien.tracking.descent.terms import (
     light_term,
     pose_vertices,
     roughness_gradient,
+    shared_terms,
     visibility_of,
     without_smooth_difference,
 )
@@ -34,13 +34,9 @@ from mien.tracking.landmarks.problem import Problem
 from mien.tracking.pixels.texture import PhotometricFit, SkinTexture, texture_space
 
 _LAST_RATE = 0.1  # factor of the learning rates at the last of a frame's steps
-_TEXTURE_GAIN = 0.15
-"""Cosine by which a frame must see a triangle more frontally than earlier frames for its texels to be learned again."""
-_TEXTURE_LEAST_COSINE = 0.1  # least cosine of the viewing angle at which a frame's texels are learned at all
 _TEXTURE_FRAMES = 40  # number of frames of each sequence from which texture and light are fitted before the epochs
 _LOST_LANDMARKS = 3.0  # standard deviations by which landmarks must be farther off than in their own fit to be lost
 _FIRST_CONVERGED = 0.01  # share by which a turn of the very first frame's steps must lower its cost for another turn
-_FIRST_MOST_TURNS = 8  # largest number of turns. One alone leaves vertices 1.51 mm off instead of 1.48 on drawn frames
 
 
 def fit_by_descent(
@@ -90,8 +86,9 @@ def fit_by_descent(
         for sequence in range(len(problem.data)):
             fit_sequence(descent, sequence, advance, problem.cache)
         if descent.done == descent.frames and known is None:
-            recenter(descent) if refined is None else measure_visibility(descent)
-            fit_appearance(descent)
+            measure_visibility(descent, some_frames(descent))
+            if refined is not None:
+                fit_appearance(descent)
         for epoch in range(problem.settings.paper.epochs):
             descent.fit_epoch(epoch, advance, problem.cache)
     return outcome()
@@ -122,44 +119,50 @@ def _as_photometric(scene: PaperScene, descent: Descent, fit: Fit, refined: Phot
 
 def fit_appearance(descent: Descent) -> None:
     """Fit texture and light again, all else fixed, to frames spread over the sequences, in random order."""
-    chosen = _some_frames(descent)
-    moments: dict[str, Moments] = {}
+    chosen, moments, weights = some_frames(descent), {}, descent.trusted()
     order = np.random.default_rng(11).permutation(np.repeat(np.arange(len(chosen)), 6))  # steps at each
     for number, index in enumerate(order):
-        _step_appearance(descent, descent.targets(*chosen[index]), moments, _fading(number, len(order)))
+        targets = descent.targets(*chosen[index])
+        moving, leaves = descent.moving(targets[0], ("texture", "light"))
+        vertices = pose_vertices(descent.scene, moving)
+        colors = [color_term(descent.scene, one, moving, vertices, weights) for one in targets]
+        gradients = _gradients(torch.stack(colors).mean() + light_term(moving.light), leaves)
+        _step(descent, targets[0].sequence, gradients, moments, _fading(number, len(order)))
 
 
-def measure_visibility(descent: Descent) -> None:
+def _gradients(cost: Tensor, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    return dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values())), strict=True))
+
+
+@torch.no_grad()
+def _step(
+    descent: Descent, sequence: int, gradients: dict[str, Tensor], moments: dict[str, Moments], rate: float
+) -> None:
+    """Move parameters that frames share, and the light of a sequence, by Adam."""
+    for name, gradient in gradients.items():
+        light = name == "light"
+        values = descent.state.lights[sequence] if light else getattr(descent.state, name)
+        own = moments.setdefault(f"light_{sequence}" if light else name, Moments.zeros(values))
+        whole = gradient + roughness_gradient(values) if name == "texture" else gradient
+        apply_adam(own, values, whole, rate * RATES["lights" if light else name])
+
+
+def measure_visibility(descent: Descent, places: Sequence[tuple[int, int]]) -> None:
     """Measure how frontally the frames see each triangle, and keep the best in the state."""
-    for sequence, row in _some_frames(descent):
+    for sequence, row in places:
         for target in descent.targets(sequence, row):
             visibility = visibility_of(descent.scene, target, descent.moving(target, ())[0])
             descent.state.visibility = torch.maximum(descent.state.visibility, visibility)
 
 
-def _some_frames(descent: Descent) -> list[tuple[int, int]]:
+def some_frames(descent: Descent) -> list[tuple[int, int]]:
+    """Frames that are spread over the sequences, as sequence and row."""
     chosen = []
     for sequence, rows in enumerate(descent.state.frames):
         count = min(len(rows), _TEXTURE_FRAMES)
         several = torch.linspace(0, len(rows) - 1, count).round().long().unique()
         chosen += [(sequence, row) for row in several.tolist()]
     return chosen
-
-
-def _step_appearance(descent: Descent, targets: Sequence[Target], moments: dict[str, Moments], rate: float) -> None:
-    scene, state, target = descent.scene, descent.state, targets[0]
-    moving, leaves = descent.moving(target, ("texture", "light"))
-    vertices = pose_vertices(scene, moving)
-    colors = [color_term(scene, one, moving, vertices, descent.trusted()) for one in targets]
-    loss = torch.stack(colors).mean() + light_term(moving.light)
-    by_texture, by_light = torch.autograd.grad(loss, list(leaves.values()))
-    light = state.lights[target.sequence]
-    with torch.no_grad():
-        by_texture += roughness_gradient(state.texture)
-        of_texture = moments.setdefault("texture", Moments.zeros(by_texture))
-        apply_adam(of_texture, state.texture, by_texture, rate * RATES["texture"])
-        of_light = moments.setdefault(f"light_{target.sequence}", Moments.zeros(light))
-        apply_adam(of_light, light, by_light, rate * RATES["lights"])
 
 
 def fit_sequence(descent: Descent, sequence: int, advance: Advance, cache: StageCache) -> None:
@@ -170,28 +173,17 @@ def fit_sequence(descent: Descent, sequence: int, advance: Advance, cache: Stage
         targets = descent.targets(sequence, row)
         if row == 0 and not descent.fixed_person:
             fit_first(descent, targets, first_of_all=sequence == 0)
+            measure_visibility(descent, [(sequence, 0)])
         else:
             if not descent.fixed_person:
-                rows[row] = descent.bounds.clip(rows[row - 1] + start[row] - start[row - 1])
+                rows[row] = rows[row - 1]
             fit_row(descent, targets, descent.scene.settings.steps)
             if _is_lost(descent, targets[0]):
                 rows[row] = start[row]
                 descent.lost.append((sequence, row))
-        for one in [] if descent.fixed_person else targets:
-            _learn_texture(descent, one)
         descent.done += 1
         advance(status=f"frame {row + 1} of {len(rows)}")
         descent.offer(cache)
-
-
-def recenter(descent: Descent) -> None:
-    """Remove the error that all frames inherited from the first frame.
-
-    Each frame was fitted to a texture that started from the first frame with the errors of its landmarks. The median
-    difference from the fit to landmarks over all frames is that error, because the errors of all landmarks average out.
-    """
-    for rows, was in zip(descent.state.frames, descent.start, strict=True):
-        rows.copy_(descent.bounds.clip(rows + (was - rows).median(0).values))
 
 
 @torch.no_grad()
@@ -214,34 +206,28 @@ def fit_first(descent: Descent, targets: Sequence[Target], first_of_all: bool) -
     cameras = [descent.scene.camera(one.sequence, one.camera, descent.state.log_focals) for one in targets]
     frontal = targets[most_frontal_camera(cameras, face)]
     guess_texture(descent.scene, frontal, descent.moving(frontal, ())[0], descent.state.texture)
-    before = math.inf
-    for turn in range(_FIRST_MOST_TURNS):
-        cost = turn_of_first(descent, targets, settings.first_steps, appearance_first=turn == 0)
-        if cost > (1 - _FIRST_CONVERGED) * before:
-            break
-        before = cost
+    before, cost = math.inf, turn_of_first(descent, targets, settings.first_steps, appearance_first=True)
+    while cost < (1 - _FIRST_CONVERGED) * before:
+        before, cost = cost, turn_of_first(descent, targets, settings.first_steps, appearance_first=False)
 
 
 def turn_of_first(descent: Descent, targets: Sequence[Target], steps: int, appearance_first: bool) -> float:
-    """Fit a first frame with texture and light, and return the mean cost of the last tenth of the steps."""
-    scene, target, costs = descent.scene, targets[0], []
-    appearance = {"texture": descent.state.texture, "light": descent.state.lights[target.sequence]}
-    rates = {"texture": RATES["texture"], "light": RATES["lights"]}
-    moments = {name: Moments.zeros(value) for name, value in appearance.items()}
+    """Fit all parameters to a first frame, and return the mean cost of the last tenth of the steps.
+
+    With `appearance_first`, only texture and light move in the first half of them.
+    """
+    scene, target, costs, moments = descent.scene, targets[0], [], {}
+    lenses = ("log_focals",) if len(descent.state.log_focals) else ()
     stepper = descent.stepper(target.sequence, target.row, smoothness=0.0)
     for step in range(steps):
-        rate = _fading(step, steps)
-        names = ("texture", "light") if appearance_first and 2 * step < steps else ("row", "texture", "light")
-        moving, leaves = descent.moving(target, names)
-        loss = descent.frame_cost(targets, moving, scene.used, None) + light_term(moving.light)
-        gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
-        costs.append(float(loss.detach()))
-        with torch.no_grad():
-            gradients["texture"] = gradients["texture"] + roughness_gradient(moving.texture)
-            for name, value in appearance.items():
-                apply_adam(moments[name], value, gradients[name], rate * rates[name])
-            if "row" in leaves:
-                stepper.step(gradients["row"], rate * RATES["row"])
+        names = () if appearance_first and 2 * step < steps else ("row", "identity", "offsets", *lenses)
+        moving, leaves = descent.moving(target, ("texture", "light", *names))
+        cost = descent.frame_cost(targets, moving, scene.used, None) + shared_terms(scene, moving, [moving.light])
+        gradients, rate = _gradients(cost, leaves), _fading(step, steps)
+        costs.append(float(cost.detach()))
+        if names:
+            stepper.step(gradients.pop("row"), rate * RATES["row"])
+        _step(descent, target.sequence, gradients, moments, rate)
     last = costs[-max(1, steps // 10) :]
     return sum(last) / max(len(last), 1)
 
@@ -250,39 +236,14 @@ def fit_row(descent: Descent, targets: Sequence[Target], steps: int) -> None:
     """Fit the pose and expression of a frame, all else fixed."""
     sequence, row = targets[0].sequence, targets[0].row
     smoothness = descent.scene.settings.pass_smoothness
-    stepper = descent.stepper(sequence, row, smoothness)
-    weights, even, around = descent.trusted(), list(targets), expected_around(descent, sequence, row)
+    stepper = descent.stepper(sequence, row, smoothness=0.0)  # Shorter steps could not follow from the frame before.
+    weights, even, around = descent.trusted(), list(targets), descent.state.frames[sequence][: row + 1]
     for step in range(steps):
         moving, leaves = descent.moving(targets[0], ("row",))
         if step % 10 == 0:  # number of a frame's steps between estimates of the unexplained light in its pictures
             even = [without_smooth_difference(descent.scene, target, moving, weights) for target in targets]
-        loss = descent.frame_cost(even, moving, weights, around, smoothness)
-        (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-        stepper.step(gradient, RATES["row"] * _fading(step, steps))
-
-
-def expected_around(descent: Descent, sequence: int, row: int) -> Float[Tensor, "t p"]:
-    """The rows for a frame's smoothness: fitted before it, expected from it on. With the past alone, heads drifted."""
-    rows, start = descent.state.frames[sequence], descent.start[sequence]
-    return torch.cat([rows[: row + 1], descent.bounds.clip(rows[row] + start[row + 1 :] - start[row])])
-
-
-def _learn_texture(descent: Descent, target: Target) -> None:
-    """Learn the texels of triangles that this frame shows more frontally than the frames before it."""
-    scene, state = descent.scene, descent.state
-    with torch.no_grad():
-        visibility = visibility_of(scene, target, descent.moving(target, ())[0])
-        better = (visibility > state.visibility + _TEXTURE_GAIN) & (visibility > _TEXTURE_LEAST_COSINE)
-    if target.row > 0 and better.any():
-        moments, steps = Moments.zeros(state.texture), 8
-        for step in range(steps):
-            moving, leaves = descent.moving(target, ("texture",))
-            vertices = pose_vertices(scene, moving)
-            loss = color_term(scene, target, moving, vertices, scene.used * better)
-            (gradient,) = torch.autograd.grad(loss, list(leaves.values()))
-            apply_adam(moments, state.texture, gradient, 3 * RATES["texture"] * _fading(step, steps))
-    seen = visibility > _TEXTURE_LEAST_COSINE
-    state.visibility = torch.where(better | (seen & (state.visibility == 0)), visibility, state.visibility)
+        gradients = _gradients(descent.frame_cost(even, moving, weights, around, smoothness), leaves)
+        stepper.step(gradients["row"], RATES["row"] * _fading(step, steps))
 
 
 def _fading(step: int, steps: int) -> float:

@@ -22,7 +22,8 @@ from mien.tracking.pixels.texture import PhotometricFit, even_light, texture_spa
 from mien.tracking.settings import PaperSettings
 
 _STIFF_REGIONS = ("eyes", "irises", "eyelids", "teeth", "tongue", "mouth", "eye_sockets", "scalp", "neck", "ears")
-"""Regions without vertex offsets. They close on each other, or the pictures do not show where they are."""
+"""Regions without vertex offsets, but in the supplement's fit. They close on each other, or pictures do not show where
+they are."""
 
 
 @dataclass(eq=False)
@@ -125,8 +126,9 @@ def paper_scene(problem: Problem, fit: Fit, refined: PhotometricFit | None = Non
         mesh_edges(face_model.faces, used),
     )  # fmt: skip
     return PaperScene(
-        face_model, layout, fit.subject.bias, mesh, weights, fit.subject.identity.float(), _offset_share(face_model),
-        _neighbors(face_model), _sequences(problem, fit), problem.settings.paper,
+        face_model, layout, fit.subject.bias, mesh, weights, fit.subject.identity.float(),
+        _offset_share(face_model, everywhere=problem.settings.published), _neighbors(face_model),
+        _sequences(problem, fit), problem.settings.paper,
     )  # fmt: skip
 
 
@@ -180,8 +182,10 @@ def _first_texture(size: int, refined: PhotometricFit | None) -> Float[Tensor, "
     return planes[0].movedim(0, 2).contiguous()
 
 
-def _offset_share(face_model: FaceModel) -> Float[Tensor, "v 1"]:
+def _offset_share(face_model: FaceModel, everywhere: bool) -> Float[Tensor, "v 1"]:
     share = torch.ones(len(face_model.template), 1)
+    if everywhere:
+        return share
     share[face_model.faces[face_model.region_mask(*_STIFF_REGIONS)].flatten()] = 0
     marks = face_model.landmarks["mediapipe"]
     share[face_model.faces[marks.faces[list(LEFT_IRIS + RIGHT_IRIS)]].flatten()] = 0

@@ -1,6 +1,7 @@
 """The costs of the `paper` schedule, in squared standard deviations, and what its pictures show of the surface."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -163,11 +164,11 @@ def smoothness_term(
     return Smoothness(own.smoothness.precision, own.smoothness.linked[first:last]).cost(window)
 
 
-def shared_terms(scene: PaperScene, state: PaperState) -> Float[Tensor, ""]:
-    """The prior costs of identity, offsets, light and focal lengths."""
+def shared_terms(scene: PaperScene, state: PaperState | Moving, lights: Iterable[Tensor]) -> Float[Tensor, ""]:
+    """The prior costs of identity, offsets, focal lengths and these lights."""
     total = ((state.identity - scene.identity) / 0.5).square().sum()  # in standard deviations of the identity's prior
     total = total + (state.log_focals / 0.03).square().sum()  # the focal length stays near that of the start
-    for light in state.lights:
+    for light in lights:
         total = total + light_term(light)
     return total + offset_term(scene, state.offsets)
 

@@ -55,7 +55,7 @@ def as_tracking(
         neck_lines=fit_neck_lines(face_model, face, cameras),
         residuals=residuals,
         # Infinity becomes a string, because json has no infinity.
-        settings=json.loads(json.dumps(dataclasses.asdict(settings)).replace("Infinity", '"inf"')),
+        settings=json.loads(json.dumps(dataclasses.asdict(settings.in_effect())).replace("Infinity", '"inf"')),
     )
 
 

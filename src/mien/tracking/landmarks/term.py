@@ -200,7 +200,7 @@ def landmark_term(
 def all_landmarks(model: LandmarkModel, views: Views, own: SequenceFit, settings: TrackingSettings) -> LandmarkTerm:
     """The cost of all landmarks at the depth of a fit. Its head poses determine the trust in each picture."""
     views = replace(views, trust=trust_of(views, own.state, own.cameras))
-    return landmark_term(model, views, landmark_weights(settings.landmarks), own.state, own.cameras)
+    return landmark_term(model, views, landmark_weights(settings.landmark_set), own.state, own.cameras)
 
 
 def quiet_landmarks(term: LandmarkTerm) -> LandmarkTerm:

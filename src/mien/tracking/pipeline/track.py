@@ -127,7 +127,7 @@ def _fit(problem: Problem) -> StageFits:
     with explaining_singular(problem.data):
         landmarks = fit_landmarks(problem)
     pixels, descent = None, None
-    if settings.schedule == "fast" or (settings.schedule == "paper" and settings.paper.start == "fast"):
+    if settings.schedule != "landmarks" and not settings.published:
         texture, lights = unknown_texture(settings.photometric.texture_size), [even_light() for _ in problem.data]
         pixels = refine_photometrically(problem, photometric_start(landmarks, texture, lights))
     if settings.schedule == "paper":
