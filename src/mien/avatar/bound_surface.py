@@ -5,12 +5,14 @@ mouths on it (`mien.training.whole_head`).
 """
 
 from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Items
 from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mien.avatar.ops.binding import Binding
 from mien.avatar.ops.hair_strands import shell_growth, strand_gaussians
 from mien.avatar.ops.surface_limits import keep_on_surface, limits_of_triangles, pull_colors
 from mien.avatar.ops.triangle_frames import triangle_ellipses, triangle_frames
@@ -22,6 +24,10 @@ _FILL_HEIGHT_SHARE = 0.9
 """Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it.
 Measured: 0.5 has 0.2 dB more at 30 degrees and 0.3 less at 90, and 1 has 0.2 dB less at 30 (log, 11-24)."""
 _OPEN_OPACITY = 0.5  # sum of the opacities of a triangle's Gaussians below which its surface is open
+_SHIFTS = ("offset_basis",)  # tensors [n, 3, r] of a store that are added to centres
+_UNLIMITED = (-1e4, 1e4, 10.0, 10.0, 1.0)
+"""Limits of what is rigid, in the order of `limits_of_triangles`."""
+_LEAST_MOTION = 3e-4  # motion of a triangle, in metres, below which nothing says what undoes it
 _COLOR_PULL = 0.05
 """Share of the difference to the completed colour that a step takes away where no picture shows a triangle. Measured: a
 tenth of it has 0.5 dB less in front (log, 11-23)."""
@@ -47,6 +53,11 @@ class SurfacePrior:
     """Filled triangles that are covered with strands of hair. None means none."""
     widening: Float[Tensor, " f"] | None = None
     """Factors on the limits to the surface, for parts that the mesh fits less well. None means 1."""
+    parts: Int[Tensor, " f"] | None = None
+    """A number for each triangle's part, or -1 on the scalp. Gaussians that are bound anew stay on it, and on the scalp
+    none is: it does not bend, and hair is far from it. None means one part."""
+    carrier: int | None = None
+    """Triangle that no expression moves. What is rigid is bound to it, without limits. None: nothing is looked for."""
 
     @property
     def fill_height(self) -> Float[Tensor, " f"]:
@@ -56,7 +67,7 @@ class SurfacePrior:
     def to(self, like: Tensor) -> "SurfacePrior":
         """The same on the device of `like`, with its float dtype."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}
-        given = {name: tensor for name, tensor in own.items() if tensor is not None}
+        given = {name: tensor for name, tensor in own.items() if isinstance(tensor, Tensor)}
         return replace(
             self, **{name: one.to(like if one.is_floating_point() else like.device) for name, one in given.items()}
         )
@@ -71,6 +82,7 @@ class BoundSurface:
         mesh: Returns vertices and faces of the person's neutral head in the head frame.
         limited: Whether Gaussians are kept flat on the surface, also if nothing is filled.
         first_colors: Whether the first colours are those of the training pictures.
+        bases: Names of tensors that the activations of a Gaussian's triangle multiply.
         penalties: The method's weighted penalties of changes with the expression (`Posed.aux`), by name.
     """
 
@@ -81,12 +93,14 @@ class BoundSurface:
         *,
         limited: bool,
         first_colors: bool,
+        bases: Items[str],
         penalties: Callable[[Mapping[str, Tensor]], dict[str, Float[Tensor, ""]]],
     ):
         self.limited, self.wants_first_colors = limited, first_colors
-        self._get_store, self._mesh, self._penalties = store, mesh, penalties
+        self._get_store, self._mesh, self._bases, self._penalties = store, mesh, bases, penalties
         self._known: Tensor | None = None
         self._tables: tuple[SurfacePrior, Tensor | None, Tensor | None] | None = None
+        self._binding: Binding | None = None
 
     @property
     def _store(self) -> GaussianStore:
@@ -134,13 +148,85 @@ class BoundSurface:
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
         """Bring Gaussians that left the surface back, and pull colours of what is rarely seen to the completed ones."""
-        if self._tables is None or self._tables[0] is not prior:
-            self._tables = (prior, *self._tables_of(prior))
-        _, limits, pulls = self._tables
+        limits, pulls = self._limits_and_pulls(prior)
         if limits is not None:
             keep_on_surface(self._store, limits, pulls)
         elif pulls is not None:
             pull_colors(self._store, pulls)
+
+    @torch.no_grad()
+    def renew_binding(self, prior: SurfacePrior) -> None:
+        """Bind each Gaussian to the triangle that it lies on, if the prior or the method keeps them to the surface.
+
+        Trained ones stay off triangles that are filled, and all stay on their part of the head: hair that hangs over a
+        cheek does not move with it.
+        """
+        if not self.limited and prior.filled_in is None:
+            return
+        store = self._store
+        shifts = [name for name in _SHIFTS if name in store.trained]
+        self._binding_of(prior).renew(store, self._limits_and_pulls(prior)[0], shifts, store.moments)
+
+    @torch.no_grad()
+    def counter_motion(
+        self, posed: Items[tuple[Float[Tensor, "v 3"], Mapping[str, Tensor]]]
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """How much of their triangles' motion Gaussians have learned to undo (1: all), and that motion, in metres.
+
+        Args:
+            posed: Vertices of the head in its own frame, and the method's changes (`Posed.aux`), of several faces.
+        """
+        store, faces, own = self._store, self._mesh()[1], self.triangles().long()
+        motion, undone = [], []
+        for vertices, changes in posed:
+            frames = triangle_frames(vertices, faces)
+            turned = frames.k[own, None, None] * frames.R[own]
+            motion.append((turned @ store["means"].detach()[..., None])[..., 0] + frames.T[own])
+            shifts = sum(changes[name].detach() for name in _SHIFTS if name in changes)
+            undone.append((turned @ shifts[..., None])[..., 0] if isinstance(shifts, Tensor) else 0 * motion[-1])
+        by_mesh, by_shifts = (torch.stack(own) - torch.stack(own).mean(0) for own in (motion, undone))
+        squares = by_mesh.square().sum(2).mean(0)
+        products = (by_mesh * by_shifts).sum(2).mean(0)
+        return -products / squares.clamp_min(_LEAST_MOTION**2), squares.sqrt()
+
+    @torch.no_grad()
+    def carry(self, rows: Int[Tensor, " k"], prior: SurfacePrior) -> Bool[Tensor, " n"]:
+        """Append copies of Gaussians that the prior's carrier holds, and return which of all are to be removed.
+
+        These are the originals, except for one on each triangle that would have none: it becomes a fill.
+        """
+        assert prior.carrier is not None
+        store, count = self._store, len(self._store)
+        lost = torch.zeros(count + len(rows), dtype=torch.bool, device=rows.device)
+        lost[rows] = True
+        zeros = {name: torch.zeros_like(store[name][rows]) for name in self._bases if name in store.trained}
+        store.append(rows, zeros)
+        copies = torch.arange(count, len(store), device=rows.device)
+        self._binding_of(prior).bind(store, copies, torch.full_like(copies, prior.carrier))
+        triangles = self.triangles().long()
+        held = torch.zeros(len(self.sizes), dtype=torch.bool, device=rows.device)
+        held[triangles[~lost]] = True
+        bare = rows[~held[triangles[rows]]]
+        first = torch.full((len(held),), len(store), device=rows.device)
+        first = first.scatter_reduce(0, triangles[bare], bare, "amin")
+        kept = bare[first[triangles[bare]] == bare]
+        self.restore(kept, prior, close=True)
+        lost[kept] = False
+        return lost
+
+    def _binding_of(self, prior: SurfacePrior) -> Binding:
+        """Which triangles lie beside each other and are filled, closed or trained alike. The carrier is for itself."""
+        if self._binding is None:
+            vertices, faces = self._mesh()
+            kinds = torch.zeros(len(faces), dtype=torch.long, device=faces.device)
+            for own in (prior.filled_in, prior.closed):
+                kinds = 2 * kinds + (0 if own is None else own.long())
+            if prior.parts is not None:
+                kinds = torch.where(prior.parts < 0, -1, 4 * prior.parts + kinds)
+            if prior.carrier is not None:
+                kinds[prior.carrier] = -1
+            self._binding = Binding(vertices.detach(), faces, kinds)
+        return self._binding
 
     @torch.no_grad()
     def restore(self, rows: Int[Tensor, " k"], prior: SurfacePrior, *, close: bool) -> None:
@@ -220,15 +306,24 @@ class BoundSurface:
             "opacity_logits": torch.logit(torch.full_like(height, FILL_OPACITY)),
         }
 
+    def _limits_and_pulls(self, prior: SurfacePrior) -> tuple[Float[Tensor, "f 5"] | None, Float[Tensor, "f 4"] | None]:
+        if self._tables is None or self._tables[0] is not prior:
+            self._tables = (prior, *self._tables_of(prior))
+        return self._tables[1:]
+
     def _tables_of(self, prior: SurfacePrior) -> tuple[Float[Tensor, "f 5"] | None, Float[Tensor, "f 4"] | None]:
         """The limits and the pulls of colours of all triangles."""
         limits = pulls = None
         if self.limited or prior.filled_in is not None:
             hair = prior.hair if prior.hanging is None else torch.maximum(prior.hair, prior.hanging)
             limits = limits_of_triangles(self.sizes, hair, prior.widening)
+            if prior.carrier is not None:
+                limits[prior.carrier] = limits.new_tensor(_UNLIMITED)
         if prior.colors is not None and prior.doubt is not None:
             # What is made up has the colours that it was given, strand by strand.
             doubt = prior.doubt if prior.filled_in is None else prior.doubt.masked_fill(prior.filled_in, 0)
             colors = torch.cat([sh_from_rgb(prior.colors), _COLOR_PULL * doubt[:, None]], dim=1)
+            if prior.carrier is not None:
+                colors[prior.carrier, 3] = 0
             pulls = colors.to(self._store["means"])
         return limits, pulls

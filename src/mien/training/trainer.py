@@ -356,18 +356,18 @@ def _update(
 def _after_update(
     state: TrainingState, head: WholeHead, data: TrainingData, progress: Progress, *, changed: bool
 ) -> None:
-    """Keep a head to its surface. After a round and at the end, remove Gaussians that pictures do not show."""
-    head.after_update()
+    """Keep a head to its surface. At times and at the end, remove Gaussians that pictures do not show."""
+    head.after_update(progress)
     head.move_hair(progress)
-    last = progress.done >= progress.steps
-    if state.density is not None and head.fills and (changed or last) and data.representative:
+    due = changed or head.finds_rigid(progress) or progress.done >= progress.steps
+    if state.density is not None and head.fills and due and data.representative:
         track = state.track
 
         def redundant() -> Bool[Tensor, " n"]:
             views = [
                 (track.face(track.index_of(*frame[:2])).detach(), data.camera(frame)) for frame in data.representative
             ]
-            return head.redundant(views, last=last)
+            return head.redundant(views, progress)
 
         state.density.thin(state.avatar.store, redundant)
 

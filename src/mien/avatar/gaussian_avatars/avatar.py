@@ -51,6 +51,7 @@ class GaussianAvatars(Avatar):
             lambda: (self.face_model.head_vertices(self.subject)[0], self.face_model.faces),
             limited=config.surface_limits,
             first_colors=config.first_colors == "pictures",
+            bases=("feature_bases", *BASES),
             penalties=lambda changes: change_penalties(config, changes),
         )
         super().__init__(config, face_model, face, Extras(surface=surface))

@@ -22,10 +22,11 @@ _MIDDLE_BLEND = 0.25  # width over which left and right blend, in units of the d
 
 
 def region_shares(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, "v g"]:
-    """Shares of regions in vertices at rest: brows and eyes, left and right, lower face, and the rest. Sums are 1.
+    """Shares of regions in vertices at rest, with a sum of 1.
 
-    The neck belongs to the lower face. The rest is what no expression moves: hair, scalp and ears. A model without the
-    landmarks `ibug68` is one region.
+    The regions are brows and eyes, left and right, the lower face with the neck, the mouth's inside, which its own
+    motion alone changes, and the rest, which no expression moves: hair, scalp and ears. A model without the landmarks
+    `ibug68` is one region.
     """
     vertices = face_model.head_vertices(subject)[0]
     if "ibug68" not in face_model.landmarks:
@@ -49,7 +50,18 @@ def region_shares(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, "
     behind = _smooth_step(marks[[0, 16], 2].mean() - vertices[:, 2], torch.zeros(()).to(wide), _FACE_BLEND * wide)
     around = torch.maximum(_smooth_step(away, torch.tensor(_FACE).to(wide), torch.tensor(_FACE_BLEND).to(wide)), behind)
     around = around * _smooth_step(vertices[:, 1], chin, _FACE_BLEND * high)
-    return torch.cat([parts * (1 - around[:, None]), around[:, None]], 1)
+    inside = _share_of_triangles(face_model, "teeth", "tongue", "mouth")[:, None]
+    face = torch.cat([parts * (1 - around[:, None]), 0 * inside, around[:, None]], 1)
+    return face * (1 - inside) + inside * torch.eye(7)[5].to(inside)
+
+
+def _share_of_triangles(face_model: FaceModel, *names: str) -> Float[Tensor, " v"]:
+    """The share of each vertex' triangles that belong to some of the model's own regions."""
+    corners, chosen = face_model.faces.long(), face_model.region_mask(*names).to(face_model.template)
+    vertices = face_model.template.new_zeros(len(face_model.template), 2)
+    for corner in corners.unbind(1):
+        vertices.index_add_(0, corner, torch.stack([chosen, torch.ones_like(chosen)], 1))
+    return vertices[:, 0] / vertices[:, 1].clamp_min(1)
 
 
 @torch.no_grad()

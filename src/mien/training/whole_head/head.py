@@ -25,10 +25,15 @@ from mien.training.settings import TrainSettings
 from mien.training.whole_head.contribution import prune_hidden
 from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.mouth_interior import cover_hidden, fill_interior, interior_colors
+from mien.training.whole_head.rigid_parts import rigid_gaussians
 from mien.training.whole_head.side_views import SideView, SideViews, side_views_of
 from mien.training.whole_head.unseen import Unseen, fills_sides, spare_fills, unseen_of
 
 HAIR_EVERY = 8  # number of training frames from one correction of the hair's surface to the next
+_RIGID_TIMES = (0.35, 0.5, 0.65)
+"""Times at which rigid parts are looked for, as fractions of the run. Before, shifts are hardly learned."""
+_RIGID_VIEWS = 4  # one of so many views is looked at
+_BOUND_EVERY = 250  # the same, from one time that Gaussians are bound anew to the next
 
 
 class WholeHead:
@@ -114,9 +119,11 @@ class WholeHead:
         if self.unseen is not None:
             self.unseen.mask_gradients(self._avatar, self._surface, *renderings)
 
-    def after_update(self) -> None:
-        """Bring Gaussians back to the surface."""
+    def after_update(self, progress: Progress) -> None:
+        """Bring Gaussians back to the surface, and bind them to what they lie on if it is due."""
         if self.unseen is not None:
+            if progress.reaches(_BOUND_EVERY) and progress.done < progress.steps:
+                self._surface.renew_binding(self.unseen.prior)
             self._surface.keep_to(self.unseen.prior)
 
     def move_hair(self, progress: Progress) -> None:
@@ -125,10 +132,20 @@ class WholeHead:
         if hair and hair.correct(self._surface, progress.done / progress.steps, self._settings.hair_rate):
             self._follow_hair()
 
-    def redundant(self, views: Items[tuple[FaceParams, Camera]], *, last: bool) -> Bool[Tensor, " n"]:
-        """The Gaussians that hardly add to any of the views. `last` says that no step follows."""
+    def finds_rigid(self, progress: Progress) -> bool:
+        """Whether this is a step after which rigid parts are looked for."""
+        return progress.completes(round(time * progress.steps) for time in _RIGID_TIMES)
+
+    def redundant(self, views: Items[tuple[FaceParams, Camera]], progress: Progress) -> Bool[Tensor, " n"]:
+        """The Gaussians that hardly add to any of the views. Rigid parts change their binding before, if it is due."""
         assert self.unseen is not None
-        return prune_hidden(self._avatar, self._surface, self.unseen, views, close=not last)
+        prior, lost, faces = self.unseen.prior, None, [face for face, _ in views[::_RIGID_VIEWS]]
+        if prior.carrier is not None and prior.closed is not None and self.finds_rigid(progress):
+            rigid = rigid_gaussians(self._avatar, self._surface, faces, prior.closed)
+            lost = self._surface.carry(rigid, prior) if len(rigid) else None
+        last = progress.done >= progress.steps
+        hidden = prune_hidden(self._avatar, self._surface, self.unseen, views, close=not last)
+        return hidden if lost is None else hidden | lost
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a checkpoint has to save."""

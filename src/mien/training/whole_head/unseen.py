@@ -30,6 +30,7 @@ from mien.training.footage.hidden import hidden_triangles
 from mien.training.settings import TrainSettings
 from mien.training.whole_head.completion import Surface, complete_colors, vertex_means
 from mien.training.whole_head.hair_height import back_hair, hair_height, hanging_hair
+from mien.training.whole_head.rigid_parts import carrier_of
 
 UNSEEN_CONFIDENCE = 0.02
 """Confidence below which a triangle is completed. Measured: 0.01 and 0.1 differ by 0.1 dB at most, from the front to 90
@@ -42,6 +43,9 @@ _HEIGHT_FRAMES = 48
 """Largest number of frames in which the mesh is drawn as high as its hair, to find what they show of hair."""
 _MOUTH_FRAMES = 240  # number of frames in which the inside of the mouth is looked for
 _MOUTH_SHOWN_SHARE = 0.02  # share of these frames that have to show a triangle of it
+_DOUBT_INSIDE, _DOUBT_OF_TEETH = 0.1, 0.02
+"""Doubt about colours of the mouth's inside and of teeth. They are learned where they are often seen, and completed
+elsewhere. Without it, teeth that were filmed between lips are also painted on the tongue behind (log, 11-30)."""
 _MOVING_WIDENING = 3.0
 """Factor on the limits to the surface at regions that move most, and inside the mouth. The tracked mesh is millimetres
 off there, and its folds are not those of the skin. Measured on wojtek (256 px, 11-23): 2.5 and 3 have the same mouth, 4
@@ -144,6 +148,7 @@ def unseen_of(avatar: Avatar, footage: Footage, *, filled: bool) -> Unseen:
     colors = complete_colors(model, neutral, seen, found.colors)
     shown = drawn_share(model, found)
     doubt: Float[Tensor, " f"] = (1 - shown) * found.above
+    doubt = torch.where(parts.interior, torch.where(parts.teeth, _DOUBT_OF_TEETH, _DOUBT_INSIDE), doubt)
     filled_in = (shown < UNSEEN_CONFIDENCE) & (found.above > 0.5)
     outside = (found.above > 0.5) & ~parts.interior
     behind_head = back_hair(model, neutral, hair, hanging)
@@ -157,9 +162,12 @@ def unseen_of(avatar: Avatar, footage: Footage, *, filled: bool) -> Unseen:
     colors = torch.where(behind[:, None], of_hair, colors)
     hair, hanging = torch.where(behind, behind_head, hair), torch.maximum(hanging, behind_head)
     strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_LEAST_HEIGHT)
-    return Unseen(
-        found, SurfacePrior(hair, hanging, colors, doubt, filled_in, filled_in | parts.interior, strands, widening)
-    )
+    carrier = carrier_of(model, avatar.subject, neutral, (shown > 0.5) & (found.above > 0.5) & ~filled_in)
+    closed = filled_in | parts.interior
+    kinds = torch.stack([parts.neck, *parts.eyes, parts.teeth, parts.tongue, parts.mouth]).long()
+    kinds = (kinds * torch.arange(1, len(kinds) + 1)[:, None]).sum(0) - parts.scalp.long()
+    prior = SurfacePrior(hair, hanging, colors, doubt, filled_in, closed, strands, widening, kinds, carrier)
+    return Unseen(found, prior)
 
 
 def drawn_at_height(footage: Footage, height: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
