@@ -19,9 +19,10 @@ from mien.training.whole_head.rigid_parts import carrier_of, rigid_gaussians
 from toy_scene import rgb_from_sh, surface_of, toy_face, toy_face_model
 
 
-def sheet(side: int = 5) -> tuple[Tensor, Tensor]:
-    """A flat sheet of `side` x `side` squares of 1 cm, and a second one on its back along the last row."""
-    grid = torch.cartesian_prod(torch.arange(side + 1.0), torch.arange(side + 1.0)) * 0.01
+def sheet() -> tuple[Tensor, Tensor]:
+    """A flat sheet of 5 x 5 rectangles in a square of 5 cm, and one triangle on its back."""
+    side, places = 5, torch.tensor([0.0, 0.007, 0.016, 0.028, 0.037, 0.05])
+    grid = torch.cartesian_prod(places, places)
     vertices = torch.cat([grid, torch.zeros(len(grid), 1)], 1)
     corner = torch.cartesian_prod(torch.arange(side), torch.arange(side)) @ torch.tensor([side + 1, 1])
     up, right = corner + 1, corner + side + 1
@@ -30,13 +31,13 @@ def sheet(side: int = 5) -> tuple[Tensor, Tensor]:
 
 
 def gaussians_on(vertices: Tensor, faces: Tensor, count: int) -> dict[str, Tensor]:
-    """Gaussians up to 15 mm from the middle of triangles in the sheet's middle."""
+    """Gaussians around the middle of triangles in the sheet's middle."""
     random = torch.Generator().manual_seed(0)
     middles = vertices[faces].mean(1)
     inner = ((middles[:, :2] > 0.015) & (middles[:, :2] < 0.035)).all(1).nonzero()[:, 0]
     return {
         "face_index": inner[torch.randint(len(inner), (count,), generator=random)],
-        "means": 1.5 * (2 * torch.rand(count, 3, generator=random) - 1),
+        "means": 1.1 * (2 * torch.rand(count, 3, generator=random) - 1),
         "quats": normalize(torch.randn(count, 4, generator=random), dim=1),
         "log_scales": torch.randn(count, 3, generator=random),
         "offset_basis": torch.randn(count, 3, 2, generator=random),
@@ -102,7 +103,7 @@ def test_gaussians_stay_where_the_new_triangle_forbids_them(limit: int | None) -
     Binding(vertices, faces, torch.zeros(len(faces), dtype=torch.long)).renew(store, limits)
     changed = store["face_index"] != bound
     low, thick, wide = local[:, 0], local[:, 2], local[:, [1, 3]].amax(1)
-    forbidden = {None: low > 9, 0: low < -0.3, 1: low > 0.3, 2: thick > 0.2, 3: wide > 0.2}[limit]
+    forbidden = {None: low > 9, 0: low < -0.3, 1: low > 0.3, 2: thick > 0.9, 3: wide > 0.9}[limit]
     assert not bool((changed & forbidden).any())
     assert int(changed.sum()) > 60
 
@@ -154,6 +155,23 @@ def test_the_optimiser_knows_gradients_in_the_new_frames() -> None:
         assert moments[name].second.min() >= 0
         squares = moments[name].second.flatten(1).sum(1), grad.square().flatten(1).sum(1)
         torch.testing.assert_close(*squares, atol=1e-5, rtol=1e-3)
+
+
+def test_changes_fade_where_colors_are_doubted() -> None:
+    avatar = toy_avatar()
+    store, count = avatar.store, len(avatar.face_model.faces)
+    doubt, none = torch.zeros(count), torch.zeros(count, dtype=torch.bool)
+    doubt[:3] = torch.tensor([1.0, 0.1, 0.02])
+    for name in ("offset_basis", "feature_bases"):
+        torch.nn.init.ones_(store[name])
+    prior = SurfacePrior(torch.zeros(count), colors=torch.full((count, 3), 0.5), doubt=doubt, filled_in=none)
+    surface_of(avatar).fade_changes(prior, 100)
+    for name in ("offset_basis", "feature_bases"):
+        own = store[name].flatten(1)
+        torch.testing.assert_close(own, own[:, :1].expand_as(own))
+        expected = torch.ones(count)
+        expected[:3] = torch.tensor([0.95**100, 0.995**100, 0.999**100])
+        torch.testing.assert_close(own[:, 0], expected, atol=1e-5, rtol=1e-3)
 
 
 def test_shifts_that_undo_the_motion_of_the_mesh_are_seen() -> None:
