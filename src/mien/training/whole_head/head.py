@@ -120,7 +120,7 @@ class WholeHead:
             self.unseen.mask_gradients(self._avatar, self._surface, *renderings)
 
     def after_update(self, progress: Progress) -> None:
-        """Bring Gaussians back to the surface. If it is due, bind them to what they lie on, and fade doubtful changes."""
+        """Bring Gaussians back to the surface. At times, bind them to what they lie on, and fade doubtful changes."""
         if self.unseen is not None:
             if progress.reaches(_BOUND_EVERY) and progress.done < progress.steps:
                 self._surface.renew_binding(self.unseen.prior)
