@@ -21,12 +21,13 @@ from mien.capture.person.survey import Survey
 from mien.capture.process import LandmarkFollower
 from mien.capture.settings import CaptureSettings
 from mien.cli import main
+from mien.disk.files import write_json
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.media.video import read_video_frames, write_video
-from mien.pipeline.capture import run_capture_stage
+from mien.pipeline.capture import check_captured, run_capture_stage
 from mien.training.run import check_videos, is_part_of
 from refusals import refuses
 from shared_things import write_toy_workspace
@@ -319,6 +320,11 @@ def test_an_interview_becomes_the_avatar_of_one_person(frames_of: Callable[..., 
     assert status == 2
     assert "--capture.person 3: " in said
     assert tree_bytes(tmp_path / "me") == before
+    given = Workspace(tmp_path / "me"), "me", [tmp_path / "talk.mp4"], ["talk"]
+    check_captured(*given, CaptureSettings())
+    write_json(given[0].run_dir("me") / "config.json", "mien.run", 1, {})
+    check_captured(*given, CaptureSettings(shortest_part=0.2))
+    refuses("run me was trained on a capture of talk.mp4 by other settings", check_captured, *given, CaptureSettings())
     assert capture("stranger.mp4", "--capture.person", "0")[0] == 0
 
 

@@ -135,6 +135,11 @@ def capture_video_parts(
     return capture_once(sequences / job.name, read, work)
 
 
+def is_captured(source: Path, sequences: Path, settings: CaptureSettings, name: str) -> bool:
+    """Whether `capture_video_parts` would find all captures of a video finished."""
+    return bool(_read_finished_parts(sequences, open_job(source, settings, name, False), tell=False))
+
+
 def _capture_parts(sequences: Path, job: CaptureJob) -> list[Capture]:
     for first in (job.name, f"{job.name}-1"):
         check_place(_capture_dir(sequences, first), job)

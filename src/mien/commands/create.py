@@ -156,7 +156,7 @@ class Command:
     def _check_files(self, workspace: Workspace, run: str) -> None:
         """Check what needs heavy libraries: the run, the cameras, the face model, the masks and the videos."""
         from mien.machine.progress import say
-        from mien.pipeline.capture import check_camera_ids
+        from mien.pipeline.capture import check_camera_ids, check_captured
         from mien.pipeline.face_models import face_model_of
         from mien.pipeline.names import doubled_videos
         from mien.pipeline.track import check_masks
@@ -173,6 +173,7 @@ class Command:
         if self.calibration is None:
             names = sequence_names(self.videos, self.name)
             check_videos(run_dir, names, workspace.sequence_names())
+            check_captured(workspace, run, self.videos, names, self.capture)
             for held in settings.held_out_sequences:
                 if not any(is_part_of(held, name) for name in names):
                     raise UserError(f"--hold-out {held}: no such sequence; there will be: {', '.join(names)}")

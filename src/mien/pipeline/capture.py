@@ -6,7 +6,7 @@ from pathlib import Path
 from mien.capture.cameras.calibration import read_calibration
 from mien.capture.capture import Capture
 from mien.capture.from_cameras import capture_cameras
-from mien.capture.from_video import capture_video_parts
+from mien.capture.from_video import capture_video_parts, is_captured
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import check_writable
 from mien.disk.workspace import Workspace
@@ -43,6 +43,20 @@ def run_capture_stage(
             _report(part)
         captures += parts
     return [capture.name for capture in captures]
+
+
+def check_captured(
+    workspace: Workspace, run: str, videos: Sequence[Path], names: Sequence[str], settings: CaptureSettings
+) -> None:
+    """Check that videos need not be captured again if a run was trained on them, because the run could not go on."""
+    if not (workspace.run_dir(run) / "config.json").is_file():
+        return
+    for video, name in zip(videos, names, strict=True):
+        if not is_captured(video, workspace.root / "sequences", settings, name):
+            raise UserError(
+                f"{workspace.root}: run {run} was trained on a capture of {video.name} by other settings, or by "
+                "another version of mien; give another folder (--out), or delete the run and its capture"
+            )
 
 
 def check_camera_ids(calibration: Path, ids: Sequence[str]) -> None:
