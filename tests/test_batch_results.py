@@ -213,7 +213,7 @@ MISTAKES = [
     ("video,stepz\nann.mp4,3", "did you mean 'steps'"), ("video\ngone.mp4", "gone.mp4: no such file"),
     (f"video\n{'x' * 300}", "x: no such file"),
     ("video,method\nann.mp4,nerf", "nerf"), ("video,steps\nann.mp4,-3", "row 1: "),
-    ("video,steps\nann.mp4,many", "row 1: Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+    ("video,steps\nann.mp4,many", "row 1: --steps: 'many' is not a whole number"),
     ("video,preset\nann.mp4,best", "row 1: invalid choice 'best' for argument '--preset'"),
     ("video,capture.sizes\nann.mp4,9", "Perhaps you meant: --capture.size"),
     ("video,hold_out,hold-out\nann.mp4,3,4", "columns 'hold_out' and 'hold-out' are the same"),

@@ -4,6 +4,7 @@ import ast
 import contextlib
 import inspect
 import io
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
@@ -19,6 +20,8 @@ from mien.errors import UserError
 from mien.machine.terminal import show
 
 _STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+_NOT_A_NUMBER = re.compile(r"Error parsing (--\S+): [^;]*?(int|float)\b[^;]*: ('[^']*')")
+"""What Python says of a text that is no number, after tyro's words."""
 _FIRST = {
     "create": ("out", "name", "preset", "method", "device", "view"),
     "render": ("out", "run", "set", "path", "motion", "yaw", "size", "background"),
@@ -107,7 +110,10 @@ def in_one_line(box: str) -> str:
         elif len(text) - len(text.lstrip()) < 8:  # descriptions are further in
             parts[-1] = f"{parts[-1]} {text.strip()}".strip()
     useless = ("For full helptext", "Argument helptext", "Got errors")
-    return "; ".join(part.rstrip(".:") for part in parts if part and not part.startswith(useless))
+    return _NOT_A_NUMBER.sub(
+        lambda found: f"{found[1]}: {found[3]} is not a {'whole ' * (found[2] == 'int')}number",
+        "; ".join(part.rstrip(".:") for part in parts if part and not part.startswith(useless)),
+    )
 
 
 def _help(command: type, prog: str, arguments: Sequence[str]) -> None:
