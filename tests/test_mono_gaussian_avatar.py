@@ -273,7 +273,8 @@ def test_lessons_teach_the_motion_of_the_face_model() -> None:
     def error(pretraining: int) -> float:
         avatar = new_avatar(replace(SMALL, start="face", points=200, pretraining=pretraining), disturbed=False)
         torch.manual_seed(1)
-        corners, weights = random_places(avatar.at_rest().vertices, avatar.face_model.faces, 200)
+        triangles, weights = random_places(avatar.at_rest().vertices, avatar.face_model.faces, 200)
+        corners = avatar.face_model.faces[triangles]
         avatar.store.assign("means", at_places(avatar.at_rest().vertices, corners, weights))
         taught = avatar.extras.pretraining
         assert (0 if taught is None else len(list(taught.run(face)))) == pretraining == (taught.count if taught else 0)

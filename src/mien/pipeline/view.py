@@ -21,6 +21,7 @@ from mien.machine.system import PARENT_VARIABLE, end_this_process
 from mien.media.camera_names import devices
 from mien.runtime.baked import MeshBound, PortableAvatar
 from mien.runtime.file import read_portable
+from mien.runtime.still import stands_still
 from mien.viewer.access import Door, is_loopback
 from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import Mesh
@@ -101,7 +102,9 @@ def open_viewed(avatar: Path, run: str | None) -> Viewed:
 def mesh_of(portable: PortableAvatar) -> Mesh | None:
     """The mesh that an avatar's Gaussians are bound to, if they are."""
     baked = portable.baked
-    return Mesh(baked.rig, baked.faces, portable.confidence) if isinstance(baked, MeshBound) else None
+    if not isinstance(baked, MeshBound) or stands_still(baked):
+        return None
+    return Mesh(baked.rig, baked.faces, portable.confidence)
 
 
 def viewed_file(path: Path) -> Viewed:

@@ -7,7 +7,7 @@ appended to the expression vector, because nothing else would move the gaze; the
 length unit of the encoding; and the opacity to prune by. The paper's ablations are in `variants.py`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,9 +39,9 @@ from mien.avatar.headgas.variants import (
     new_network,
 )
 from mien.avatar.ops.activation import sigmoid
-from mien.avatar.ops.expression_changes import expression_inputs, principal_directions
+from mien.avatar.ops.expression_changes import ExpressionActivations, expression_inputs, principal_directions
 from mien.avatar.ops.feature_network import Layers, feature_network
-from mien.avatar.ops.points import positional_encoding, sample_surface
+from mien.avatar.ops.points import at_places, positional_encoding, random_places
 from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
 from mien.errors import UserError
@@ -49,7 +49,8 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians, Rendering
-from mien.runtime.baked import AttributeNetwork, Attributes, FeatureDirections, Static
+from mien.runtime.baked import AttributeNetwork, Attributes, FeatureChanges, FeatureDirections, MeshBound, Static
+from mien.runtime.still import standing_still
 
 _OPACITY_RATE = Rate(0.05)  # of opacities that Gaussians have themselves. Of 3D Gaussian Splatting
 
@@ -62,33 +63,41 @@ class HeadGas(Avatar):
     config: HeadGasConfig
     rest: Tensor
     directions: Tensor
-    judged: Tensor
+    judged: FaceParams
+    """Faces at which opacities to prune by are computed."""
 
     def __init__(self, config: HeadGasConfig, face_model: FaceModel, face: FaceParams):
         n, ablation = config.points, ABLATIONS.get(config.variant)
         unbaked = ablation and ablation.unbaked and f"the variant {config.variant} of headgas: {ablation.unbaked}"
         super().__init__(config, face_model, face, Extras(unbaked=unbaked))
-        means = sample_surface(face_model.head_vertices(self.subject)[0], face_model.faces, n)
+        vertices, faces = face_model.head_vertices(self.subject)[0], face_model.faces
+        triangles, weights = random_places(vertices, faces, n)
+        means = at_places(vertices, faces[triangles], weights)
         # The average of `no_mlp` is one of expression weights, which directions are not.
         rest, directions = input_directions(face, self.subject, 0 if config.variant == "no_mlp" else config.directions)
         self.rest, self.directions = (nn.Buffer(tensor) for tensor in (rest, directions))
         spread = spread_out((expression_inputs(face) - rest) @ directions, config.judged_expressions)
-        # Not in files: only training needs it, and makes it anew.
-        self.judged = nn.Buffer(spread.detach().clone(), persistent=False)
+        # Not in files: only training needs them, and finds them anew.
+        self.judged = face[spread].detach()
+        self.activations = None
+        if config.activations == "regions":
+            _check_regions(config)
+            self.activations = ExpressionActivations(face_model, face, self.subject, config.directions)
         shapes = {
             "means": means,
             "quats": means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             "log_scales": neighbor_distances(means).clamp_min(1e-6).log()[:, None].repeat(1, 3),
         }
-        k = directions.shape[1]
+        k = directions.shape[1] if self.activations is None else config.directions
         if ablation is None:
             features = feature_tensors(means, k, config.features)
             sizes = [config.features + encoded(config), config.hidden, colors_of(config) + 1]
             network = new_network(sizes)
         else:
             features, network = ablation.tensors(means, k, config), ablation.network(k, config)
-        self.store, self.network = GaussianStore(shapes | features), network.to(means)
-        self.bases_gradient, self._baked, self._ablation = FactoredGradient(), Kept[Static](), ablation
+        fixed = None if self.activations is None else {"face_index": triangles}
+        self.store, self.network = GaussianStore(shapes | features, fixed), network.to(means)
+        self.bases_gradient, self._baked, self._ablation = FactoredGradient(), Kept[Static | MeshBound](), ablation
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
         """The Gaussians in the head frame, one batch entry per timestep. Colours and opacities differ between them.
@@ -105,8 +114,7 @@ class HeadGas(Avatar):
         ):
             baked = self._baked.of((*self.parameters(), *self.buffers()), self.bake)
             return Posed(pose_baked(baked, face), {})
-        inputs = (expression_inputs(face) - self.rest) @ self.directions
-        changes = list(self._changes(inputs, progress))
+        changes = list(self._changes(self._inputs(face), progress))
         sh = _stacked([one.colors for one in changes]).unflatten(-1, (-1, 3))
         opacities = sigmoid(_stacked([one.opacity_logits for one in changes]))
         scales = store["log_scales"].exp()
@@ -154,35 +162,40 @@ class HeadGas(Avatar):
         teeth, are not pruned while these are not drawn.
         """
         highest = seen
-        for changes in self._changes(self.judged):
+        for changes in self._changes(self._inputs(self.judged.to(self.rest))):
             highest = torch.maximum(highest, sigmoid(changes.opacity_logits))
         return highest
 
-    def bake(self) -> Static:
-        """Static points, with the bases of the features and the network."""
+    def bake(self) -> Static | MeshBound:
+        """Static points, with the bases of the features and the network. With regions, bound to triangles that stand."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         store = self.store.arrays()
         n = len(self.store)
-        neutral, along = self._baked_features()
         weights, biases = ([getattr(layer, part) for layer in self.network[::2]] for part in ("weight", "bias"))
         shares = self.output_shares(TRAINED).to(weights[-1])
         if len(self.network) % 2 == 0:
             # A record has no activation after its last layer, so the shares are a layer after the network's own.
             weights, biases = [*weights, torch.eye(len(shares)).to(shares)], [*biases, torch.zeros_like(shares)]
         weights[-1], biases[-1] = weights[-1] * shares[:, None], biases[-1] * shares
+        layers = tuple(map(as_array, weights)), tuple(map(as_array, biases))
+        none, no_sh = np.zeros(n, np.float32), np.zeros((n, colors_of(self.config) // 3, 3), np.float32)
+        attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
+        names, free = self.face_model.expression_names, self.face_model.free_joint_names
+        if self.activations is not None:
+            features = FeatureChanges(store["neutral_features"], store["bases"], as_array(self.encoding()), *layers)
+            changes = replace(self.activations.record(), features=features)
+            return standing_still(store["means"], attributes, names, free, changes, store["face_index"])
+        neutral, along = self._baked_features()
         network = AttributeNetwork(
             input="features",
             base=np.concatenate([as_array(neutral), as_array(self.encoding())], axis=1),
-            weights=tuple(map(as_array, weights)),
-            biases=tuple(map(as_array, biases)),
+            weights=layers[0],
+            biases=layers[1],
             activation="leaky_relu",
             outputs=("sh", "opacity_logits"),
             along=along,
         )
-        none, no_sh = np.zeros(n, np.float32), np.zeros((n, colors_of(self.config) // 3, 3), np.float32)
-        attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
-        names, free = self.face_model.expression_names, self.face_model.free_joint_names
         return Static(store["means"], attributes, names, free, network=network)
 
     def _baked_features(self) -> tuple[Float[Tensor, "n w"], FeatureDirections]:
@@ -194,8 +207,14 @@ class HeadGas(Avatar):
         same = np.broadcast_to(np.eye(k, dtype=np.float32), (n, k, k))
         return self.rest.new_zeros(n, k), FeatureDirections(rest, directions, same.copy())
 
-    def _changes(self, inputs: Float[Tensor, "b k"], progress: Progress = TRAINED) -> Iterator[Changes]:
-        """Colours and opacities at each of some timesteps, whose inputs are along the directions."""
+    def _inputs(self, face: FaceParams) -> Float[Tensor, "b k"] | Iterator[Float[Tensor, "f k"]]:
+        """The inputs along the directions at each timestep: the same of all Gaussians, or those of each triangle."""
+        if self.activations is None:
+            return (expression_inputs(face) - self.rest) @ self.directions
+        return map(self.activations, (face[timestep] for timestep in range(len(face))))
+
+    def _changes(self, inputs: Iterable[Float[Tensor, "*f k"]], progress: Progress = TRAINED) -> Iterator[Changes]:
+        """Colours and opacities at each of some timesteps, with the inputs of `_inputs`."""
         if self._ablation is not None:
             yield from self._ablation.changes(self, inputs, progress)
             return
@@ -209,11 +228,12 @@ class HeadGas(Avatar):
             yield Changes(*self.outputs(e, encoding, layers))
 
     def outputs(
-        self, inputs: Float[Tensor, " k"], encoding: Float[Tensor, "n c"], layers: Layers
+        self, inputs: Float[Tensor, "*f k"], encoding: Float[Tensor, "n c"], layers: Layers
     ) -> tuple[Float[Tensor, "n p"], Float[Tensor, " n"]]:
         """The outputs of a network at one timestep: all but the last, and the last."""
         bases, neutral = self.store["bases"], self.store["neutral_features"]
-        return feature_network(bases, inputs, None, neutral, encoding, layers, self.bases_gradient)
+        rows = None if self.activations is None else self.store["face_index"]
+        return feature_network(bases, inputs, rows, neutral, encoding, layers, self.bases_gradient)
 
     def output_shares(self, progress: Progress) -> Float[Tensor, " o"]:
         """Factors of colours and opacity. Of higher degrees of colours, a share, and 0 before they begin."""
@@ -247,20 +267,28 @@ def input_directions(
     return rest.clone(), principal_directions(inputs - rest, min(count, len(rest)))
 
 
+def _check_regions(config: HeadGasConfig) -> None:
+    if config.variant != "full" or config.directions == 0 or config.sh_degree > 0:
+        raise UserError(
+            f"--method.activations regions: give --method.variant full instead of {config.variant}, --method.directions "
+            f"above 0 (now {config.directions}), and --method.sh-degree 0 instead of {config.sh_degree}; or whole"
+        )
+
+
 def _stacked(parts: Sequence[Tensor]) -> Tensor:
     # Training poses one timestep at a time, and needs no copy.
     return parts[0][None] if len(parts) == 1 else torch.stack(tuple(parts))
 
 
-def spread_out(points: Float[Tensor, "t k"], count: int) -> Float[Tensor, "c k"]:
-    """At most `count` of the points: each is the farthest from those before it, the first from the mean."""
+def spread_out(points: Float[Tensor, "t k"], count: int) -> list[int]:
+    """Indices of at most `count` points: each is the farthest from those before it, the first from the mean."""
     chosen: list[int] = []
     distances = (points - points.mean(0)).norm(dim=-1)
     while len(chosen) < min(count, len(points)):
         chosen.append(int(distances.argmax()))
         from_it = (points - points[chosen[-1]]).norm(dim=-1)
         distances = from_it if len(chosen) == 1 else torch.minimum(distances, from_it)
-    return points[chosen]
+    return chosen
 
 
 def neighbor_distances(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

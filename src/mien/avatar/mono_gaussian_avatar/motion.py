@@ -191,7 +191,8 @@ class FreePoints(Avatar, ABC):
         for step in range(steps):
             optimizer.param_groups[0]["lr"] = _PRETRAINING_RATE * 0.1 ** (step / steps)
             frames = face[torch.randint(len(face), (_PRETRAINING_FRAMES,))].detach()
-            corners, weights = random_places(canonical, faces, _PRETRAINING_POINTS)
+            triangles, weights = random_places(canonical, faces, _PRETRAINING_POINTS)
+            corners = faces[triangles]
             means = at_places(canonical, corners, weights)
             target = at_places(self.face_model.head_vertices(frames), corners, weights)
             found, _ = self.deformed(means, frames)

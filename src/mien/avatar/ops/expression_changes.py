@@ -26,6 +26,7 @@ _EXPRESSIONS_BEYOND = 1.2
 1.14, of d3 up to 1.06, of other clips up to 1.21. With 1, wojtek's held-out frames lose 0.03 dB (11-27)."""
 _EXPRESSIONS_LEAST_DEVIATION = 0.1  # smallest deviation that is scaled to 1, relative to that of the first direction
 
+_POSE = 6  # most activations of the head's pose, which has no more directions
 _SHIFT = 5.0
 """Weight of a shift of the head by a metre, relative to a turn with a sine of 1."""
 MARGIN = 0.1
@@ -54,7 +55,7 @@ class ExpressionActivations(nn.Module):
     shares: Tensor
 
     def __init__(self, face_model: FaceModel, face: FaceParams, neutral: FaceParams, count: int):
-        """Take `count` numbers for each triangle, a region's and the pose's in turn.
+        """Take `count` numbers for each triangle, a region's and at most `_POSE` of the pose in turn.
 
         The directions, and the range of the activations, are those of the timesteps of `face`. Directions that the
         timesteps do not have are 0.
@@ -62,14 +63,15 @@ class ExpressionActivations(nn.Module):
         super().__init__()
         shares, motions = region_shares(face_model, neutral), vertex_motions(face_model, neutral)
         rest = expression_inputs(neutral)[0]
-        offsets, own = expression_inputs(face) - rest, (count + 1) // 2
+        of_pose = min(count // 2, _POSE)
+        offsets, own = expression_inputs(face) - rest, count - of_pose
         # What is around the face moves with none of it, and changes with all of it.
         own_motion = shares.unbind(1) if shares.shape[1] == 1 else shares.unbind(1)[:-1]
         roots = [_weighted_root(motions, share) for share in own_motion] + [None] * (shares.shape[1] - len(own_motion))
         parts = [principal_directions(offsets, own, root) for root in roots]
         seen = [_EXPRESSIONS_BEYOND * outermost(offsets @ part) for part in parts]
         moved = head_motion(neutral, face)
-        pose = principal_directions(moved, count // 2, torch.diag(moved.new_tensor([1.0] * 3 + [_SHIFT] * 3)))
+        pose = principal_directions(moved, of_pose, torch.diag(moved.new_tensor([1.0] * 3 + [_SHIFT] * 3)))
         values = {
             "rest": rest,
             "directions": torch.cat(parts, 1),

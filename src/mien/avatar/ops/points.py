@@ -15,15 +15,15 @@ def positional_encoding(points: Float[Tensor, "*b 3"], bands: int) -> Float[Tens
 @torch.no_grad()
 def random_places(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], count: int
-) -> tuple[Int[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Corners and barycentric coordinates of places on a mesh, uniform by area, from torch's default generator."""
+) -> tuple[Int[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Triangles and barycentric coordinates of places on a mesh, uniform by area, from torch's default generator."""
     v0, v1, v2 = vertices[faces].unbind(1)
     areas = torch.linalg.cross(v1 - v0, v2 - v0).norm(dim=-1)
     chosen = torch.multinomial(areas, count, replacement=True)
     # The square root makes the points uniform over a triangle.
     along, across = torch.rand(2, count, 1).to(vertices)
     along = along.sqrt()
-    return faces[chosen], torch.cat([1 - along, along * (1 - across), along * across], dim=-1)
+    return chosen, torch.cat([1 - along, along * (1 - across), along * across], dim=-1)
 
 
 def at_places(
@@ -35,4 +35,5 @@ def at_places(
 
 def sample_surface(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], count: int) -> Float[Tensor, "n 3"]:
     """Random points on a mesh, uniform by area, from torch's default generator."""
-    return at_places(vertices, *random_places(vertices, faces, count))
+    triangles, weights = random_places(vertices, faces, count)
+    return at_places(vertices, faces[triangles], weights)

@@ -22,15 +22,13 @@ from mien.runtime.baked import (
     FeatureChanges,
     MeshBound,
     PortableAvatar,
-    Rig,
     Static,
 )
 from mien.runtime.posing import Face
+from mien.runtime.still import standing_still
 
 Baked = TypeVar("Baked", bound=BakedAvatar)
 FORMAT, VERSION = "mien.packed", 1
-_UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
-"""A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,35 +183,7 @@ def bound_features(avatar: PortableAvatar, baked: Static) -> MeshBound | None:
             biases=network.biases,
         ),
     )
-    return MeshBound(
-        rig=_still_rig(avatar),
-        faces=np.array([[0, 1, 2]], np.int32),
-        face_index=np.zeros(len(baked.means), np.int32),
-        means=baked.means,
-        attributes=baked.attributes,
-        sh_frame="head",
-        changes=changes,
-    )
-
-
-def _still_rig(avatar: PortableAvatar) -> Rig:
-    """One triangle on a root joint. The face's joints are there, and move nothing."""
-    e, names = len(avatar.expression_names), ("root", *avatar.joint_names)
-    k = len(names)
-    weights = np.zeros((3, k), np.float32)
-    weights[:, 0] = 1
-    return Rig(
-        template=_UNIT_FRAME,
-        expression_names=avatar.expression_names,
-        expression_basis=np.zeros((e, 3, 3), np.float32),
-        joint_names=names,
-        joint_parents=(-1, *(0 for _ in avatar.joint_names)),
-        joint_free=(False, *(True for _ in avatar.joint_names)),
-        joint_template=np.zeros((k, 3), np.float32),
-        joint_rotation_basis=np.zeros((e, k, 3), np.float32),
-        joint_translation_basis=np.zeros((e, k, 3), np.float32),
-        skinning_weights=weights,
-    )
+    return standing_still(baked.means, baked.attributes, avatar.expression_names, avatar.joint_names, changes)
 
 
 def _ordered(baked: MeshBound) -> MeshBound:
