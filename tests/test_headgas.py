@@ -1,6 +1,7 @@
 """HeadGaS and its ablations follow their formulas. tests/test_methods.py trains, saves and bakes them."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
@@ -14,23 +15,29 @@ from mien.avatar.headgas.avatar import HeadGas, input_directions, neighbor_dista
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.headgas.variants import MOVED, SHIFT_LENGTH, averaging_weights
 from mien.avatar.methods import method_named
+from mien.avatar.ops.binding import squared_distances
 from mien.avatar.ops.points import positional_encoding, sample_surface
+from mien.avatar.ops.regions import region_shares
 from mien.avatar.resting import neutral_of
 from mien.avatar.settings import Progress
 from mien.errors import UserError
-from mien.face import FaceModel, FaceParams
+from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.posing import head_poses
+from mien.pipeline.view import mesh_of
 from mien.render import rasterize
 from mien.rotation import matrix_from_quaternion
-from mien.runtime import pose
+from mien.runtime import pose, read_portable, write_portable
 from mien.training import PRESETS
 from mien.training.adam import Adam
+from refusals import refuses
 from test_feature_network import product
 from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(
     points=40, features=5, directions=0, sh_degree=1, sh_warmup=0.0, sh_higher_share=1.0, judged_expressions=0
 )
+
+REGIONS = replace(SMALL, activations="regions", directions=9, sh_degree=0)
 
 
 def new_avatar(config: HeadGasConfig = SMALL, face_model: FaceModel | None = None) -> HeadGas:
@@ -108,16 +115,51 @@ def test_bases_may_be_trained_by_adam_and_centres_through_their_encoding() -> No
 
 
 def test_children_of_a_split_copy_features_and_opacity_has_no_reset() -> None:
-    avatar, parents = new_avatar(), torch.tensor([3, 3, 9])
+    avatar, parents = new_avatar(REGIONS), torch.tensor([3, 3, 9])
     fill(avatar)
     density = avatar.density()
     avatar.store.append(parents, density.split(avatar.store, parents, torch.randn(3, 3)))
-    for name in ("bases", "neutral_features", "means"):
+    for name in ("bases", "neutral_features", "face_index", "means"):
         assert torch.equal(avatar.store[name][-3:], avatar.store[name][parents]) == (name != "means")
     assert density.opacity_logits is None
     for preset in method_named("headgas").presets:
         config: Any = PRESETS[preset].config("headgas")
         assert config.density.opacity_resets == ()
+
+
+def test_brows_do_not_follow_the_mouth_with_regions_nor_in_files(tmp_path: Path) -> None:
+    model = load_face_model("anny")
+    rest, generator = model.neutral(20), torch.Generator().manual_seed(3)
+    random = torch.rand(rest.expression.shape, generator=generator), 0.2 * torch.randn(20, 3, generator=generator)
+    face = replace(rest, expression=random[0], head_rotation=random[1])
+    mouth = torch.eye(len(model.expression_names))[model.expression_names.index("mouthLowerDownLeft")]
+    faces = [face[2], replace(face[2], expression=face[2].expression + mouth)]
+    faces += [replace(face[2], head_rotation=face[2].head_rotation + 0.2)]
+    still = {}
+    for activations in ("whole", "regions"):
+        torch.manual_seed(0)
+        avatar = HeadGas(replace(REGIONS, points=4000, activations=activations), model, face)
+        fill(avatar)
+        store, vertices = avatar.store, model.head_vertices(avatar.subject)[0]
+        before, after, turned = (avatar.pose(one).gaussians for one in faces)
+        still[activations] = (before.sh == after.sh)[0].flatten(1).all(1)
+    corners = vertices[model.faces[store["face_index"]]]
+    torch.testing.assert_close(squared_distances(store["means"], corners), torch.zeros(4000), rtol=0, atol=1e-12)
+    shares = region_shares(model, avatar.subject)[model.faces][store["face_index"]].mean(1)
+    brows = (shares[:, 2:] == 0).all(1)
+    assert (int(brows.sum()) > 9, bool(still["whole"].any())) == (True, False)
+    assert (bool(still["regions"][brows].all()), bool(still["regions"][shares[:, 4] > 0.1].any())) == (True, False)
+    assert not (before.sh == turned.sh)[0].flatten(1).all(1).any(), "with the head's pose, all change"
+    write_portable(tmp_path / "a.mien", portable := make_portable(avatar, toy_camera(32), "toy"))
+    baked = read_portable(tmp_path / "a.mien").baked
+    assert mesh_of(portable) is None, "nothing is bound to the person's mesh"
+    for one, trained in zip(faces, (before, after, turned), strict=True):
+        found = pose(baked, runtime_face(one))
+        assert torch.equal(torch.from_numpy(found.sh), trained.sh[0])
+        assert torch.equal(torch.from_numpy(found.opacities), trained.opacities[0])
+        torch.testing.assert_close(torch.from_numpy(found.means), trained.means.expand(4000, 3), rtol=0, atol=1e-6)
+    for wrong in ({"variant": "delta"}, {"directions": 0}, {"sh_degree": 1}):
+        refuses("--method.activations regions: .*; give full, more", new_avatar, replace(REGIONS, **wrong))
 
 
 def test_higher_degrees_learn_slower_and_begin_later() -> None:

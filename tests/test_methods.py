@@ -45,6 +45,7 @@ SMALL = HeadGasConfig(
 )
 CONFIGS: dict[str, MethodConfig] = {method: plain_config(method) for method in METHODS}
 CONFIGS |= {f"headgas-{name}": replace(SMALL, variant=name) for name in get_args(Variant) if name != "full"}
+CONFIGS["headgas-regions"] = replace(SMALL, activations="regions", sh_degree=0)
 CONFIGS["gaussian_avatars-features"] = plain_gaussian_avatars(
     expression_rank=3, appearance="features", appearance_directions=5, appearance_features=6, density=GROWING
 )
@@ -84,7 +85,7 @@ def started(config: MethodConfig, settings: TrainSettings = SETTINGS) -> tuple[T
 def test_first_fifty_steps_lower_the_loss(method: str) -> None:
     config, settings = CONFIGS[method], replace(SETTINGS, steps=3000)
     if isinstance(config, HeadGasConfig):
-        config = HeadGasConfig(variant=config.variant)
+        config = HeadGasConfig(variant=config.variant, activations=config.activations)
     state, data = started(config, settings)
     for _ in range(50):
         step(state, data, settings)

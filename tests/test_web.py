@@ -49,7 +49,8 @@ def bound(portable: runtime.PortableAvatar) -> runtime.MeshBound:
     [(lambda: drawn_head(500), "plain.mien"), (lambda: drawn_head(500, 3), "changes.packed"),
      (lambda: drawn_head(500, 5, columns=2), "columns.mien"),
      *((lambda: drawn_head(500, 5, columns=2, features=16), f"features.{form}") for form in ("mien", "packed")),
-     *((lambda: web.painted_head(300), f"headgas.{form}") for form in ("mien", "packed"))],
+     *((lambda: web.painted_head(300), f"headgas.{form}") for form in ("mien", "packed")),
+     (lambda: web.painted_head(300, activations="regions"), "headgas-regions.packed")],
 )  # fmt: skip
 def test_faces_are_posed_as_in_python(built: Path, tmp_path: Path, head, name: str) -> None:
     """Centres to 1e-5 m. Outputs of the network of headgas, whose Gaussians are bound in a .mien file, to 1e-3."""

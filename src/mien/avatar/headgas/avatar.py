@@ -167,7 +167,7 @@ class HeadGas(Avatar):
         return highest
 
     def bake(self) -> Static | MeshBound:
-        """Static points, with the bases of the features and the network. With regions, bound to triangles that stand."""
+        """Points, with the bases of the features and the network; with regions, bound to triangles that stand."""
         if self.extras.unbaked is not None:
             raise UserError(f"{self.extras.unbaked}; {UNBAKED_REMEDY}")
         store = self.store.arrays()
@@ -270,8 +270,8 @@ def input_directions(
 def _check_regions(config: HeadGasConfig) -> None:
     if config.variant != "full" or config.directions == 0 or config.sh_degree > 0:
         raise UserError(
-            f"--method.activations regions: give --method.variant full instead of {config.variant}, --method.directions "
-            f"above 0 (now {config.directions}), and --method.sh-degree 0 instead of {config.sh_degree}; or whole"
+            f"--method.activations regions: --method.variant {config.variant}, --method.directions {config.directions} "
+            f"and --method.sh-degree {config.sh_degree} do not fit it; give full, more than 0 and 0, or whole"
         )
 
 

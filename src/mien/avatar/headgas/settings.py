@@ -28,8 +28,8 @@ class HeadGasConfig(MethodConfig):
     """Number of directions of the face along which features change: those of the largest spread over the training
     timesteps. 0: the inputs themselves, as in the paper and always in `no_mlp`. Fewer need less memory and time."""
     activations: Literal["whole", "regions"] = "whole"
-    """What the directions are of: the whole face, as in the paper; or, for each Gaussian, the region of the face where it
-    began and the head's pose, never far beyond what was filmed (`regions`; not for ablations and `sh_degree` above 0)."""
+    """What the directions are of: the whole face, as in the paper, or, for each Gaussian, the region of the face where
+    it began, and the head's pose (`regions`). Regions stop soon beyond what was filmed. Ablations have none."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4
