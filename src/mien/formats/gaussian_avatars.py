@@ -32,6 +32,7 @@ from mien.face.params import FaceParams
 from mien.formats.format import Content, NoOptions
 from mien.formats.ply import BINDING, property_names, read_columns, stacked, stacked_sh, write_rows
 from mien.runtime.baked import MeshBound
+from mien.runtime.still import follows_mesh
 
 POINTS, PARAMETERS, MODEL = "point_cloud.ply", "flame_param.npz", "face_model"
 """Names of the files. The face model's are MODEL.json and MODEL.safetensors."""
@@ -55,7 +56,7 @@ def write_gaussian_avatars_folder(folder: Path, avatar: Avatar, face: FaceParams
     The folder is made if it is missing, and files of the same names are replaced.
     """
     baked = avatar.bake()
-    if not isinstance(baked, MeshBound):
+    if not follows_mesh(baked):
         raise UserError(
             f"{folder}: GaussianAvatars' folder holds Gaussians that are bound to triangles, and those of this run's "
             "method are not; export a .mien or a .ply instead"

@@ -22,8 +22,8 @@ from mien.gaussians import Gaussians
 from mien.machine.progress import track_progress
 from mien.pipeline.drive import open_driver
 from mien.pipeline.expression import with_expression
-from mien.runtime.baked import MeshBound, PortableAvatar
-from mien.runtime.still import stands_still
+from mien.runtime.baked import PortableAvatar
+from mien.runtime.still import follows_mesh
 from mien.training.footage.filmed import read_coverage
 from mien.training.run import read_face_track, run_camera
 from mien.training.whole_head.soft_cut import with_soft_cut
@@ -57,8 +57,7 @@ class RunContent(Content):
     def mesh(self) -> MeshModel:
         """Return the mesh that the Gaussians are bound to, or else the person's, with its texture coordinates."""
         model, baked = self._avatar.face_model, self._avatar.bake()
-        bound = isinstance(baked, MeshBound) and not stands_still(baked)
-        rig = baked.rig if bound else bake_rig(model, self._avatar.subject)
+        rig = baked.rig if follows_mesh(baked) else bake_rig(model, self._avatar.subject)
         return MeshModel(rig, *map(as_array, (model.faces, model.uv, model.uv_faces)))
 
     def pose(self) -> Gaussians:

@@ -19,9 +19,9 @@ from mien.machine.progress import say
 from mien.machine.stops import Terminated
 from mien.machine.system import PARENT_VARIABLE, end_this_process
 from mien.media.camera_names import devices
-from mien.runtime.baked import MeshBound, PortableAvatar
+from mien.runtime.baked import PortableAvatar
 from mien.runtime.file import read_portable
-from mien.runtime.still import stands_still
+from mien.runtime.still import follows_mesh
 from mien.viewer.access import Door, is_loopback
 from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import Mesh
@@ -102,9 +102,7 @@ def open_viewed(avatar: Path, run: str | None) -> Viewed:
 def mesh_of(portable: PortableAvatar) -> Mesh | None:
     """The mesh that an avatar's Gaussians are bound to, if they are."""
     baked = portable.baked
-    if not isinstance(baked, MeshBound) or stands_still(baked):
-        return None
-    return Mesh(baked.rig, baked.faces, portable.confidence)
+    return Mesh(baked.rig, baked.faces, portable.confidence) if follows_mesh(baked) else None
 
 
 def viewed_file(path: Path) -> Viewed:

@@ -1,9 +1,11 @@
 """Gaussians that change with the face and stand still: bound to triangles that never move, so that GPUs run them."""
 
+from typing import TypeGuard
+
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from mien.runtime.baked import Attributes, ExpressionChanges, MeshBound, Rig
+from mien.runtime.baked import Attributes, BakedAvatar, ExpressionChanges, MeshBound, Rig
 
 _UNIT_FRAME = np.array([[-1 / 3, 0, 1 / 3], [2 / 3, 0, 1 / 3], [-1 / 3, 0, -2 / 3]], np.float32)
 """A triangle whose frame is the head's: the first edge is +x, the normal +y, the centre the origin, the size 1."""
@@ -46,6 +48,6 @@ def standing_still(
     )
 
 
-def stands_still(baked: MeshBound) -> bool:
-    """Whether the rig is that of `standing_still`, which is no mesh of a person."""
-    return np.array_equal(baked.rig.template, _UNIT_FRAME)
+def follows_mesh(baked: BakedAvatar) -> TypeGuard[MeshBound]:
+    """Whether Gaussians are bound to the mesh of a person, which that of `standing_still` is not."""
+    return isinstance(baked, MeshBound) and not np.array_equal(baked.rig.template, _UNIT_FRAME)

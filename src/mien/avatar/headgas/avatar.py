@@ -80,8 +80,7 @@ class HeadGas(Avatar):
         # Not in files: only training needs them, and finds them anew.
         self.judged = face[spread].detach()
         self.activations = None
-        if config.activations == "regions":
-            _check_regions(config)
+        if config.activations == "regions" and ablation is None and config.directions > 0 and config.sh_degree == 0:
             self.activations = ExpressionActivations(face_model, face, self.subject, config.directions)
         shapes = {
             "means": means,
@@ -216,6 +215,7 @@ class HeadGas(Avatar):
     def _changes(self, inputs: Iterable[Float[Tensor, "*f k"]], progress: Progress = TRAINED) -> Iterator[Changes]:
         """Colours and opacities at each of some timesteps, with the inputs of `_inputs`."""
         if self._ablation is not None:
+            assert isinstance(inputs, Tensor)
             yield from self._ablation.changes(self, inputs, progress)
             return
         first, _, last = self.network
@@ -265,14 +265,6 @@ def input_directions(
     if count == 0:
         return torch.zeros_like(rest), torch.eye(len(rest)).to(rest)
     return rest.clone(), principal_directions(inputs - rest, min(count, len(rest)))
-
-
-def _check_regions(config: HeadGasConfig) -> None:
-    if config.variant != "full" or config.directions == 0 or config.sh_degree > 0:
-        raise UserError(
-            f"--method.activations regions: --method.variant {config.variant}, --method.directions {config.directions} "
-            f"and --method.sh-degree {config.sh_degree} do not fit it; give full, more than 0 and 0, or whole"
-        )
 
 
 def _stacked(parts: Sequence[Tensor]) -> Tensor:

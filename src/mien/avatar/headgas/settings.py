@@ -29,7 +29,8 @@ class HeadGasConfig(MethodConfig):
     timesteps. 0: the inputs themselves, as in the paper and always in `no_mlp`. Fewer need less memory and time."""
     activations: Literal["whole", "regions"] = "whole"
     """What the directions are of: the whole face, as in the paper, or, for each Gaussian, the region of the face where
-    it began, and the head's pose (`regions`). Regions stop soon beyond what was filmed. Ablations have none."""
+    it began, and the head's pose, soon beyond what was filmed no further (`regions`). Ablations, `directions` 0, and an
+    `sh_degree` above 0 always have the whole face."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4
