@@ -249,12 +249,13 @@ def run(site: Path, scripts: list[str], webgpu: bool = True) -> dict[str, Any]:
 HEADS = {
     "gaussian_avatars": lambda: drawn_head(4000, rank=2, sh=4, sh_frame="world"),
     "features": lambda: drawn_head(10_011, rank=5, columns=2, features=6), "headgas": lambda: web.painted_head(1500),
+    "regions": lambda: web.painted_head(1500, activations="regions"),
     "mono_gaussian_avatar": skinned_head, "colors that depend on the view": lambda: points(1500)["points"],
 }  # fmt: skip
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize("method", list(HEADS)[:4])
+@pytest.mark.parametrize("method", list(HEADS)[:5])
 def test_pictures_are_those_of_the_native_renderer(site: Path, method: str) -> None:
     """Posed and sorted on the GPU."""
     portable = HEADS[method]()
@@ -272,7 +273,7 @@ def test_a_page_draws_every_kind_with_webgl2(tmp_path: Path, method: str) -> Non
     assert write_page(tmp_path / "a.html", portable).psnr >= 45
     told = browse(tmp_path / "a.html", ["(async () => (await mien).poser.runsNetwork)()", *map(posing, faces)])
     assert told["requests"] == []
-    assert (told["results"][0] is False) == (method in ("features", "headgas")), "its network runs on the GPU"
+    assert (told["results"][0] is False) == (method in ("features", "headgas", "regions")), "its network runs on the GPU"
     expect_pictures(portable, faces, told)
 
 

@@ -7,7 +7,7 @@ export const THREADS = 256;
 export const TILE = 1024;
 
 /** Most activations of an avatar. */
-export const MOST_RANK = 128;
+export const MOST_RANK = 256;
 
 /** What the passes know of a face: activations [g, a] of the regions. */
 const POSE = `
