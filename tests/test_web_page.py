@@ -273,7 +273,7 @@ def test_a_page_draws_every_kind_with_webgl2(tmp_path: Path, method: str) -> Non
     assert write_page(tmp_path / "a.html", portable).psnr >= 45
     told = browse(tmp_path / "a.html", ["(async () => (await mien).poser.runsNetwork)()", *map(posing, faces)])
     assert told["requests"] == []
-    assert (told["results"][0] is False) == (method in ("features", "headgas", "regions")), "its network runs on the GPU"
+    assert (told["results"][0] is False) == (method in ("features", "headgas", "regions")), "on the GPU"
     expect_pictures(portable, faces, told)
 
 
