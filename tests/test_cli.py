@@ -2,17 +2,13 @@
 
 import importlib
 import json
-import os
 import re
 import shlex
 import shutil
-import signal
 import sys
 import wave
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_args, get_type_hints
 
 import cv2
@@ -20,10 +16,8 @@ import numpy as np
 import pytest
 
 from damage import edit_json
-from forked import ForkServer
 from mien.cli import COMMANDS, main
 from mien.commands.parsing import explained, with_defaults
-from mien.disk.files import write_atomically
 from mien.disk.workspace import Workspace
 from mien.media.video import write_video
 from mien.pipeline.names import doubled_videos
@@ -139,45 +133,6 @@ def test_a_bug_keeps_its_traceback_in_a_log(tmp_path: Path, monkeypatch: pytest.
     assert not [word for word in ("Traceback", "\x1b") if word in shown]
     (log,) = tmp_path.glob("mien-crash-*.log")
     assert "ZeroDivisionError" in log.read_text()
-
-
-STOPPED = "mien: stopped; the same command continues where it stopped, or starts again\n"
-
-
-@dataclass(frozen=True)
-class Terminated:
-    """A command that is terminated while it writes, twice."""
-
-    out: Path
-
-    def check(self) -> None:
-        """Accept everything."""
-
-    def run(self) -> None:
-        """Write half a film."""
-        write_atomically(self.out, self._write)
-
-    def _write(self, path: Path) -> None:
-        path.write_text("half")
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-        finally:
-            os.kill(os.getpid(), signal.SIGTERM)
-            print("cleaned up")
-
-
-def end_terminated(words: list[str]) -> int:
-    """Run that command in this process, which must be a fork."""
-    sys.modules["mien.commands.demo"] = SimpleNamespace(Command=Terminated)  # type: ignore[assignment]
-    return main(words)
-
-
-def test_a_terminated_command_removes_what_is_unfinished(fork_server: ForkServer, tmp_path: Path) -> None:
-    """A terminated command removes unfinished files, as after Ctrl-C, even if a second signal comes meanwhile."""
-    words = ["demo", "--out", str(tmp_path / "film.mp4")]
-    ended = fork_server.call("test_cli:end_terminated", words, exits=True)
-    assert (ended.wait(), ended.stdout, ended.stderr) == (143, "cleaned up\n", STOPPED)
-    assert list(tmp_path.iterdir()) == []
 
 
 SKEWED = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": (2 * np.eye(4)).tolist(), "width": 32, "height": 32}

@@ -114,8 +114,10 @@ def test_foreign_and_damaged_files_are_refused(glb: Path, tmp_path: Path) -> Non
         for edit in edits:
             rewritten(glb, path, edit)
             refuses(told, read_glb_avatar, path)
-    path.write_bytes(b"glTF is not here")
-    refuses("is damaged, or not a .glb file", read_glb_avatar, path)
+    whole = glb.read_bytes()
+    for damaged in (b"", b"glTF", whole[:1000], b"x" + whole[1:], whole[:20] + b"[" + whole[21:], whole + b"1"):
+        path.write_bytes(damaged)
+        refuses(r"a\.glb: is damaged, or not a \.glb file", read_glb_avatar, path)
 
 
 WIDE = 256
