@@ -22,5 +22,6 @@ def complaint(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     """Run a command that must be refused in one line, and return the line."""
     capsys.readouterr()
     assert main(list(map(str, words))) == EXIT_USER_ERROR
-    (line,) = (text for text in capsys.readouterr().err.splitlines() if text.startswith("mien: "))
+    (line,) = (text for text in capsys.readouterr().err.splitlines() if text.strip())
+    assert line.startswith("mien: ")
     return line

@@ -114,8 +114,7 @@ def test_no_advice_to_delete_a_folder_that_holds_an_avatar(run_dir: Path, tmp_pa
     readers = {"config.json": read_run_config, "metrics.json": read_metrics, "training.json": read_training_summary}
     for name, read in readers.items():
         (tmp_path / name).touch()
-        error = refuses("cannot be read as json", read, tmp_path)
-        assert "delete its folder" not in error
+        assert "delete its folder" not in refuses("cannot be read as json", read, tmp_path)
     refuses("delete this file, not its folder, and run `mien evaluate` again", read_metrics, tmp_path)
     shutil.copytree(run_dir / "avatar", tmp_path / "avatar")
     for name in ("face_model.safetensors", "avatar.json"):

@@ -27,8 +27,7 @@ def read_by_node(built: Path, content: bytes, tmp_path: Path) -> str:
     path = tmp_path / "head.packed"
     path.write_bytes(content)
     script = [node(), str(WEB / "tests" / "read.mjs"), str(built / "mien.js"), str(path)]
-    done = subprocess.run(script, check=True, capture_output=True, timeout=SECONDS)
-    found = json.loads(done.stdout)
+    found = json.loads(subprocess.run(script, check=True, capture_output=True, timeout=SECONDS).stdout)
     assert found["memory"] < MOST_BYTES
     return found["message"]
 
@@ -107,8 +106,7 @@ def test_a_name_that_looks_like_a_mark_stays_a_name(tmp_path: Path) -> None:
     """It would take the place of the avatar, a thousand times. Longer names are refused."""
     name = "{{avatar}}{{webgpu}}" * 25
     plain = write_page(tmp_path / "plain.html", named("x" * len(name)))
-    written = write_page(tmp_path / "page.html", named(name))
-    assert written.size < plain.size + 1000
+    assert write_page(tmp_path / "page.html", named(name)).size < plain.size + 1000
     assert (tmp_path / "page.html").read_text().count(name) == TEMPLATE.read_text().count("{{title}}")
     with pytest.raises(UserError, match="a name in it has more than 1,000 characters"):
         runtime.write_portable(tmp_path / "a.mien", named("{{avatar}}" * 1000))

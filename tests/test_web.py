@@ -113,8 +113,7 @@ def posing(face: runtime.Face) -> str:
 def test_a_page_works_alone(tmp_path: Path) -> None:
     portable, page = drawn_head(4000, rank=2, sh=4, sh_frame="world"), tmp_path / "drawn.html"
     faces = [runtime.Face(**vars(portable.neutral)), *faces_of(portable, 2)]
-    written = write_page(page, portable, web.motion_of(faces))
-    assert written.size == page.stat().st_size
+    assert write_page(page, portable, web.motion_of(faces)).size == page.stat().st_size
     scripts = [*map(posing, faces), REST, script(WHITE, SLIDE, SHOW), REST]
     told = web.browse(page, [*scripts, *(script(WHITE, step) for step in (CLEAR + SHOW, TURN, SHOW, PLAY))])
     assert (told["requests"], told["messages"]) == ([], [])
