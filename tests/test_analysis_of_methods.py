@@ -19,7 +19,7 @@ from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.settings import GradientSettings, PerceptualLoss, Photometric
 from mien.cli import main
 from mien.gaussians import Gaussians
-from mien.lab.analysis import headgas, mono_gaussian_avatar
+from mien.lab.analysis import headgas, measuring, mono_gaussian_avatar
 from mien.lab.analysis.headgas import Trained, busy_face, start_of_bases, trained_range, with_expression
 from mien.lab.analysis.joining import joined_rows
 from mien.lab.analysis.measuring import head_camera, mouth_camera
@@ -109,8 +109,8 @@ def test_several_subjects_are_joined_to_statistics(toy: Path, tmp_path: Path, ca
 def test_the_ablations_are_trained_and_timed_alike(
     workspace: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    timed, measure = [], headgas.measure_drawing
-    monkeypatch.setattr(headgas, "measure_drawing", lambda *args: timed.append(args[0].training) or measure(*args))
+    timed, measure = [], measuring.measure_drawing
+    monkeypatch.setattr(measuring, "measure_drawing", lambda *args: timed.append(args[0].training) or measure(*args))
     asked = ("--parts", "ablations", "--steps", "6", "--seconds", "0.01")
     part = analyze("headgas", workspace, *asked)["ablations"]
     assert "ablations: 5 trainings of 6 steps each" in capsys.readouterr().err
@@ -152,7 +152,7 @@ def test_rows_differ_only_in_what_they_say() -> None:
 
 def test_the_network_without_blending_widens_to_a_plateau(monkeypatch: pytest.MonkeyPatch) -> None:
     scores: dict[int, float | None] = {8: 20.0, 16: 20.5, 32: 20.55, 64: 30.0}
-    monkeypatch.setattr(headgas, "held_out_scores", lambda width, metric: {"head_psnr": scores[width]})
+    monkeypatch.setattr(measuring, "held_out_scores", lambda width, metric: {"head_psnr": scores[width]})
     context: Any = SimpleNamespace(train=lambda name, config: config.hidden)
     first: Any = 8
     assert headgas.widened(context, CONFIG, first) == (16, {8: 20.0, 16: 20.5, 32: 20.55})
@@ -182,8 +182,8 @@ def test_the_mouth_is_that_of_a_frontal_frame_with_shut_lips(context: Context, m
     assert headgas.shut_lips([sequence, found]) == (1, 7), "of 3 and 7, it is the one that is not turned"
     (own,) = context.sequences
     vars(context)["sequences"] = [replace(own, capture=replace(own.capture, landmarks=marks[5:10]))]
-    drawn, draw = [], headgas.draw_avatar
-    monkeypatch.setattr(headgas, "draw_avatar", lambda *given: drawn.append(given[1]) or draw(*given))
+    drawn, draw = [], measuring.draw_avatar
+    monkeypatch.setattr(measuring, "draw_avatar", lambda *given: drawn.append(given[1]) or draw(*given))
     picture = headgas.layers(context).pictures[1]
     assert "The mouth in clip, timestep 2, whose lips are shut" in picture.caption
     wanted = read_face_track(context.run_dir, context.avatar.face_model)[2]

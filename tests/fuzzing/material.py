@@ -215,7 +215,7 @@ def _write_splats(folder: Path, avatar: Avatar) -> None:
     written(folder / "colors.ply", {"red": "uint8"}, "\r", 1)
     plain = (folder / "colors.ply").read_bytes()
     (folder / "packed.ply").write_bytes(plain.replace(b"end_header", b"property uint packed_position\rend_header", 1))
-    spz(folder / "old.spz", 2, [(128, 127, 128), (255, 128, 127), (0, 127, 128)], 1)
+    spz(folder / "old.spz", [(128, 127, 128), (255, 128, 127), (0, 127, 128)], 1)
     with torch.no_grad():
         write_spz(folder / "new.spz", in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
 

@@ -108,8 +108,7 @@ def capture_once(folder: Path, read: Callable[[bool], _Result | None], work: Cal
 
 def _capture_whole(out: Path, job: CaptureJob) -> Capture:
     check_place(out, job)
-    scratch = partial_folder(out).with_suffix(".survey")
-    with cleaning_up(out, scratch) as survey_folder:
+    with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
         survey, given = _run_survey(job, survey_folder)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
         draft = _draft(job, enumerate(job.frames.frames()), part, (1, 1), given, out)

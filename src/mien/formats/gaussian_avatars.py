@@ -172,7 +172,6 @@ def _binding(columns: dict[str, np.ndarray], path: Path, triangles: int) -> Int[
 
 
 def _face_model_of(folder: Path) -> FaceModel | None:
-    """The face model in the folder, or None."""
     if not (folder / _MODEL_FILES[0]).exists():
         return None
     for name in _MODEL_FILES:
@@ -186,7 +185,6 @@ def _face_model_of(folder: Path) -> FaceModel | None:
 
 
 def _refuse_links(path: Path) -> None:
-    """Check that a file of the folder is an ordinary file."""
     try:
         open_to_read(path).close()
     except FileNotFoundError:

@@ -80,8 +80,7 @@ def write_glb(
         about["animates"] = _ANIMATES
         scenes.append({"name": "gaussians", "nodes": [len(content["nodes"]) - 1]})
         used += [_SPLATS, EXTENSION]
-    generator = f"mien {avatar.about.mien}"
-    content["asset"] = {"version": "2.0", "generator": generator, "extras": {"mien": about}}
+    content["asset"] = {"version": "2.0", "generator": f"mien {avatar.about.mien}", "extras": {"mien": about}}
     content |= {"scene": 0, "scenes": scenes, "extensionsUsed": used}
     if not mesh_only:
         content["extensions"] = {EXTENSION: _avatar_extension(path, writer, avatar)}

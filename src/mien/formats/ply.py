@@ -236,7 +236,6 @@ def _pose_of(path: Path, lines: list[str]) -> Float32[np.ndarray, "4 4"] | None:
 def _activated(
     columns: dict[str, np.ndarray], pose: Float32[np.ndarray, "4 4"] | None, path: Path
 ) -> "mien.gaussians.Gaussians":
-    """Gaussians from raw columns by name."""
     import torch
 
     from mien.gaussians import Gaussians

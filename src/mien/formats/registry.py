@@ -67,8 +67,7 @@ def find_format(name: str) -> Format | None:
 
 def _first(fits: Callable[[Format], bool]) -> Format | None:
     """Return the first format that fits. Other packages are asked only if it is none of mien's own."""
-    own = next(filter(fits, _OWN), None)
-    return own or next(filter(fits, formats()), None)
+    return next(filter(fits, _OWN), None) or next(filter(fits, formats()), None)
 
 
 def numbered(path: Path, index: int) -> Path:

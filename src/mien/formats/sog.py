@@ -153,8 +153,7 @@ def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
         counts = np.diff(ends)
         book = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), book)
     book = np.sort(book.astype(np.float32))
-    codes = np.searchsorted((book[1:] + book[:-1]) / 2, values)
-    return codes.astype(np.uint8), book.tolist()
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8), book.tolist()
 
 
 def _add_palette(pictures: dict[str, bytes], higher: np.ndarray, width: int) -> dict[str, Any]:
@@ -202,8 +201,7 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     largest = np.abs(quats).argmax(1)
     signed = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1, 1)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    kept = np.take_along_axis(signed, others, 1)
-    codes = np.clip(np.round((kept / np.sqrt(2) + 0.5) * 255), 0, 255)
+    codes = np.clip(np.round((np.take_along_axis(signed, others, 1) / np.sqrt(2) + 0.5) * 255), 0, 255)
     return np.concatenate([codes, largest[:, None] + _MODE], axis=1).astype(np.uint8)
 
 

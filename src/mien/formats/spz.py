@@ -101,7 +101,6 @@ def read_spz(path: Path) -> "mien.gaussians.Gaussians":
 
 
 def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
-    """The file of version 4 with these columns."""
     import zstandard
 
     # A quarter of a second for 40,000 Gaussians, and 3 % smaller than by the default level.
@@ -113,7 +112,6 @@ def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
 
 
 def _shapes(count: int, degree: int, quat_bytes: int = 4) -> list[tuple[int, ...]]:
-    """The shapes of all columns."""
     if count > MAX_GAUSSIANS:
         raise ValueError(f"it has {count:,} Gaussians, and at most {MAX_GAUSSIANS:,} are read")
     return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, quat_bytes), (count, (degree + 1) ** 2 - 1, 3)]

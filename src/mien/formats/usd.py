@@ -128,8 +128,7 @@ def _layer_alone(path: Path) -> Any:
     # USD ends the whole process where it uses a prim without a name.
     if any(place.isEmpty for place in places) or not all(found):
         raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
-    clips = any(prim.HasInfo("clips") for prim in found)
-    if clips or layer.GetCompositionAssetDependencies():
+    if any(prim.HasInfo("clips") for prim in found) or layer.GetCompositionAssetDependencies():
         raise UserError(f"{path}: refers to other files, which are not opened; flatten it into one file")
     return layer
 

@@ -109,7 +109,6 @@ class DrawingLoop:
         return 0.0
 
     def _serve(self, key: int, client: _Client, view: View, wanted: int, full: bool) -> None:
-        """Draw and show a picture for a client."""
         began = self._clock()
         picture = self._draw(view, full)
         ended = self._clock()

@@ -73,8 +73,7 @@ def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> H
         best[better], best_cost[better] = points[better], cost[better]
     agrees = _misses(best, centers, sides, cameras) < _HEAD_MOST_MISS
     agrees[agrees.sum(axis=1) < 2] = False
-    refined = triangulate(centers[:, :, None], agrees, cameras)[:, 0]
-    return HeadPath(refined, agrees)
+    return HeadPath(triangulate(centers[:, :, None], agrees, cameras)[:, 0], agrees)
 
 
 def triangulate(

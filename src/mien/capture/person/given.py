@@ -181,8 +181,7 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
                 continue
             if len(line) not in (0, 2 * LANDMARKS):
                 raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
-            numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
-            rows.append(np.array(numbers))
+            rows.append(np.array([_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)))
             if len(rows) > most:
                 break
     except (OSError, ValueError, csv.Error) as error:

@@ -59,8 +59,6 @@ class Motion:
 
 @dataclass(frozen=True)
 class _Code:
-    """How an array is stored."""
-
     bits: Literal[8, 16]
     axis: Literal["first", "columns"]
     signed: bool = False

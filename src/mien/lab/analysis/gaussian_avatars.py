@@ -286,8 +286,7 @@ def jaw_opening(face: FaceParams, model: FaceModel) -> Float[Tensor, " b"]:
 
 
 def _jaw_expression(model: FaceModel) -> int:
-    jaw = model.joint_names.index("jaw")
-    return int(model.joint_rotation_basis[:, jaw].norm(dim=-1).argmax())
+    return int(model.joint_rotation_basis[:, model.joint_names.index("jaw")].norm(dim=-1).argmax())
 
 
 def _most_open(experiment: Experiment) -> list[Frame]:
@@ -295,8 +294,7 @@ def _most_open(experiment: Experiment) -> list[Frame]:
     model = experiment.avatar.face_model
     by_time = {(frame.sequence, frame.timestep): frame for frame in reversed(experiment.held_out_frames)}
     openings = {key: float(jaw_opening(experiment.face(frame), model)[0]) for key, frame in by_time.items()}
-    widest = sorted(openings, key=lambda key: (-openings[key], key))[:12]
-    return [by_time[key] for key in widest]
+    return [by_time[key] for key in sorted(openings, key=lambda key: (-openings[key], key))[:12]]
 
 
 @torch.no_grad()

@@ -205,8 +205,7 @@ def run_analysis(
                 say(f"{part.name}: measured before")
             else:
                 run = named(f"mien.lab.analysis.{analysis.method}:{part.name.replace('-', '_')}")
-                result = json.loads(json.dumps(run(context).write(folder)))
-                content["parts"][part.name] = {"key": key, **result}
+                content["parts"][part.name] = {"key": key, **json.loads(json.dumps(run(context).write(folder)))}
                 write_json(record, _FORMAT, _VERSION, content)
             for finding in content["parts"][part.name]["findings"]:
                 say(f"{part.name}: {finding}")

@@ -236,8 +236,7 @@ def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | 
     middle = mean_rotation(true)
     signals = [axis_angle_from_matrix(middle.T @ turns).numpy() for turns in (tracked @ steady, true)]
     speed = axis_angle_from_matrix(true[:-1].mT @ true[1:]).norm(dim=-1).numpy() * fps
-    fast = np.concatenate([speed > np.radians(15.0), [False]])
-    return following(signals[0], signals[1], fast, _around(fps))
+    return following(signals[0], signals[1], np.concatenate([speed > np.radians(15.0), [False]]), _around(fps))
 
 
 def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor, "3 3"]:
@@ -248,8 +247,7 @@ def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor
 
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:
     """Return, for all timesteps but the first and the last, whether true landmarks stand still around them."""
-    moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
-    still = moving < 0.02  # pixels a frame
+    still = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1) < 0.02  # pixels a frame
     return still[1:] & still[:-1]
 
 

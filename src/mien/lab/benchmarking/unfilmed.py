@@ -228,8 +228,7 @@ def _masks(pictures: PosedPictures, timestep: int, camera: int) -> Mapping[str, 
         area = np.zeros(size, np.uint8)
         for points in marks:
             for polygon in polygons:
-                corners = np.round(points[list(polygon)] * 16).astype(np.int32)
-                cv2.fillPoly(area, [corners], 1, cv2.LINE_8, 4)
+                cv2.fillPoly(area, [np.round(points[list(polygon)] * 16).astype(np.int32)], 1, cv2.LINE_8, 4)
         if margin:
             width = 2 * max(1, round(margin * eye)) + 1
             area = cv2.dilate(area, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
@@ -240,8 +239,7 @@ def _masks(pictures: PosedPictures, timestep: int, camera: int) -> Mapping[str, 
 
 def _sheet(pictures: PosedPictures, drawn: Mapping[tuple[int, int], Tensor]) -> np.ndarray:
     """True faces above the avatar's, in front."""
-    marks = pictures.truth.landmarks[0, 0]
-    oval = marks[list(_OVAL)]
+    oval = pictures.truth.landmarks[0, 0][list(_OVAL)]
     middle, half = oval.mean(0), 0.62 * float(np.ptp(oval[:, 1]))
     rows, columns = (slice(max(int(c - half), 0), int(c + half)) for c in middle[::-1])
 

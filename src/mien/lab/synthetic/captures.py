@@ -227,7 +227,6 @@ def _make_capture(
 
 
 def _detect_landmarks(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
-    """Yield the landmarks that a detector finds in each camera's pictures."""
     with progress_bar(f"Detecting landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
         for camera in range(len(scene.cameras)):
             found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)

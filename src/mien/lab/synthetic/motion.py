@@ -46,7 +46,6 @@ class _Span:
 
 
 def _lay_out(recipe: SyntheticRecipe) -> tuple[_Span, ...]:
-    """Return the recipe's script as spans in time."""
     segments = recipe.script or (Segment("free", recipe.seconds),)
     ends = list(accumulate(segment.seconds for segment in segments))
     last = len(segments) - 1

@@ -76,7 +76,6 @@ def _away_from_eyes(model: FaceModel, points: np.ndarray) -> Float[np.ndarray, "
 
 
 def _field(points: np.ndarray, noise: SolidNoise, wavelength: float, shift: float) -> Float[np.ndarray, "v 3"]:
-    """Return a smooth random vector field."""
     return np.stack([noise(points + shift + 3.7 * axis * wavelength, wavelength) for axis in range(3)], -1)
 
 

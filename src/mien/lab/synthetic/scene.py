@@ -202,8 +202,7 @@ def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
     """
     focal = recipe.focal * recipe.width
     K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])
-    front = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    viewmats = [front]
+    viewmats = [torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))]
     target = torch.tensor([0.0, 0.0, -recipe.distance])
     for index, name in enumerate(recipe.camera_ids[1:], 1):
         share = (index - 1) / max(len(recipe.camera_ids) - 2, 1)

@@ -256,8 +256,7 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
     n, s = strands.widths.shape
     room = light.irradiance(np.ascontiguousarray(outwards.reshape(-1, 3))).reshape(n, s, 3)
     colors = 0.75 * strands.colors * room
-    views = unit(viewpoint - strands.points)
-    along_view = dot(tangents, views)
+    along_view = dot(tangents, unit(viewpoint - strands.points))
     across_view = np.sqrt(np.maximum(1 - along_view**2, 0))
     relative = strands.colors / (strands.colors.max(-1, keepdims=True) + 1e-6)
     depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair under other hair is darker
@@ -309,8 +308,7 @@ def shade_eye(
     shadow = (0.30 + 0.70 * smoothstep(-0.0005, 0.0045, under_lid))[:, None]
     # Light through the cornea reaches the far side of the iris, so its diffuse light is like that of a bowl.
     outward = normals - along(normals, axis)[:, None] * axis
-    bowl = unit(normals - 1.2 * share * outward)
-    diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
+    diffuse = albedo * light.irradiance(unit(normals - 1.2 * share * outward).astype(np.float32)) * shadow
     if not is_wet:
         return diffuse
     cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])

@@ -164,8 +164,7 @@ def _paint_eyes(canvas: _Canvas, anatomy: Anatomy, view: FrontView) -> None:
     in_front = smoothstep(anatomy.landmarks[33, 2] - 0.02, anatomy.landmarks[33, 2] - 0.01, points[:, 2])
     for side in SIDES:
         upper, lower = anatomy.curve(places.UPPER_LIDS[side], 40), anatomy.curve(places.LOWER_LIDS[side], 40)
-        outline = np.concatenate([upper, lower[::-1]])
-        around = view.look_up(view.polygon(outline, 0.006), points) * in_front
+        around = view.look_up(view.polygon(np.concatenate([upper, lower[::-1]]), 0.006), points) * in_front
         below = view.look_up(view.polygon(lower - [0, 0.007, 0], 0.003), points) * in_front
         under = view.look_up(view.line(lower - [0, 0.008, 0], 0.004, 0.003), points) * in_front
         rim = view.look_up(view.line(lower, 0.0012, 0.0006), points) * in_front
