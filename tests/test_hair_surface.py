@@ -32,7 +32,7 @@ from mien.training.whole_head.hair_surface import HairSurface, hair_surface
 from mien.training.whole_head.head import prepare_whole_head
 from mien.training.whole_head.unseen import Unseen
 from plain_settings import plain_run
-from test_training_resume import RESULTS
+from test_training_batch import RESULTS
 from toy_scene import rgb_from_sh, surface_of, toy_sequence
 from train_toy import stopped_at
 

@@ -18,7 +18,7 @@ from mien.pipeline import train as training
 from mien.training import PRESETS, TrainSettings
 from refusals import complaint
 from shared_things import toy_workspace
-from test_training_resume import RESULTS
+from test_training_batch import RESULTS
 from toy_scene import toy_face_model
 
 RUN, STANDARD = TrainSettings(), GaussianAvatarsConfig()
