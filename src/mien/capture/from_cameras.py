@@ -269,18 +269,11 @@ def _finish(
         **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
     }
     finish(
-        layout,
-        out,
-        chunks,
-        report,
-        name=whole.name,
-        fps=frame_rate(timestamps, whole.frames.fps),
-        timestamps=timestamps,
-        landmarks=landmarks,
-        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64),
-        source=source,
+        layout, out, chunks, report, name=whole.name, fps=frame_rate(timestamps, whole.frames.fps),
+        timestamps=timestamps, landmarks=landmarks,
+        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64), source=source,
         calibration=cameras,
-    )
+    )  # fmt: skip
 
 
 def _cropped(camera: Camera, crop: Crop) -> Camera:

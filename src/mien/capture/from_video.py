@@ -382,17 +382,10 @@ def _finish(job: CaptureJob, draft: Draft, place: tuple[int, int], given: GivenI
         **detector_entry(job.detector if given.landmarks is None else "mediapipe"),
     }
     finish(
-        draft.layout,
-        out,
-        [draft.chunks],
-        report,
-        name=part.name,
-        fps=frame_rate(timestamps, job.frames.fps),
-        timestamps=timestamps,
-        landmarks=landmarks,
-        principal_point=part.crop.to_output(survey.picture_size / 2)[None],
+        draft.layout, out, [draft.chunks], report, name=part.name, fps=frame_rate(timestamps, job.frames.fps),
+        timestamps=timestamps, landmarks=landmarks, principal_point=part.crop.to_output(survey.picture_size / 2)[None],
         source=source,
-    )
+    )  # fmt: skip
 
 
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:

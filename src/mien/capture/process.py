@@ -259,13 +259,9 @@ def finish(
     each = [vars(relative_quality(measured[:, camera])) for camera in range(len(chunks))]
     quality = FrameQuality(**{name: np.concatenate([one[name] for one in each], axis=1) for name in each[0]})
     capture = Capture(
-        camera_ids=layout.camera_ids,
-        images=layout.blank(FRAMES),
-        mattes=layout.blank(MATTES),
-        valid=np.isfinite(facts["landmarks"][..., 0, 0]),
-        quality=quality,
-        **facts,
-    )
+        camera_ids=layout.camera_ids, images=layout.blank(FRAMES), mattes=layout.blank(MATTES),
+        valid=np.isfinite(facts["landmarks"][..., 0, 0]), quality=quality, **facts,
+    )  # fmt: skip
     report |= quality_report(capture.name, quality, measured.reshape(-1, MEASURES))
     for entry in layout.folder.iterdir():
         if entry.name not in (FRAMES, MATTES, CACHE):

@@ -92,19 +92,10 @@ def _read_capture(path: Path) -> Capture:
         # The folder was replaced while it was mapped, so the maps may be of two captures.
         raise UserError(f"{path}: was replaced while it was read; run the same command again")
     return Capture(
-        name=content["name"],
-        camera_ids=camera_ids,
-        fps=fps,
-        timestamps=arrays["timestamps"],
-        images=images,
-        mattes=mattes,
-        landmarks=arrays["landmarks"],
-        valid=arrays["valid"],
-        principal_point=arrays["principal_point"],
-        source=content["source"],
-        calibration=calibration,
-        quality=quality,
-    )
+        name=content["name"], camera_ids=camera_ids, fps=fps, timestamps=arrays["timestamps"], images=images,
+        mattes=mattes, landmarks=arrays["landmarks"], valid=arrays["valid"], principal_point=arrays["principal_point"],
+        source=content["source"], calibration=calibration, quality=quality,
+    )  # fmt: skip
 
 
 def _calibration(arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[Camera, ...] | None:
@@ -154,15 +145,9 @@ def finish_capture(
         write_json(folder / REPORT_NAME, "mien.capture_report", 1, report)
     frame_files.stamp_cache(layout, capture_hash)
     content = {
-        "name": capture.name,
-        "camera_ids": list(capture.camera_ids),
-        "fps": capture.fps,
-        "timesteps": layout.timesteps,
-        "width": layout.width,
-        "height": layout.height,
-        "capture_hash": capture_hash,
-        "source": capture.source,
-    }
+        "name": capture.name, "camera_ids": list(capture.camera_ids), "fps": capture.fps, "timesteps": layout.timesteps,
+        "width": layout.width, "height": layout.height, "capture_hash": capture_hash, "source": capture.source,
+    }  # fmt: skip
     write_json(folder / JSON_NAME, FORMAT, VERSION, content)
     replace_folder(path, folder)
     return capture_hash

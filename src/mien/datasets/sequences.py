@@ -63,14 +63,10 @@ def tracked_sequence(
     landmarks, valid = _landmarks(face_model, face, views), np.ones(mattes.shape[:2], bool)
     capture = _capture(path, name, images, mattes, cameras, fps, landmarks, valid, {})
     tracking = Tracking(
-        face_model=face_model.name,
-        face_model_hash=face_model.content_hash,
-        face=face,
-        valid=torch.ones(len(mattes), dtype=torch.bool),
-        cameras=views,
-        neck_lines=fit_neck_lines(face_model, face, views),
-        residuals=torch.zeros(mattes.shape[:2]),
-    )
+        face_model=face_model.name, face_model_hash=face_model.content_hash, face=face,
+        valid=torch.ones(len(mattes), dtype=torch.bool), cameras=views,
+        neck_lines=fit_neck_lines(face_model, face, views), residuals=torch.zeros(mattes.shape[:2]),
+    )  # fmt: skip
     return TrackedSequence(capture, tracking, face_model)
 
 
@@ -103,18 +99,11 @@ def _capture(
 ) -> Capture:  # fmt: skip
     views = tuple(cameras.values())
     return Capture(
-        name=name,
-        camera_ids=tuple(cameras),
-        fps=fps,
-        timestamps=np.arange(len(mattes)) / fps,
-        images=images,
-        mattes=mattes,
-        landmarks=landmarks,
-        valid=valid,
+        name=name, camera_ids=tuple(cameras), fps=fps, timestamps=np.arange(len(mattes)) / fps, images=images,
+        mattes=mattes, landmarks=landmarks, valid=valid,
         principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
-        source={"file": path.name, **found_by},
-        calibration=views,
-    )
+        source={"file": path.name, **found_by}, calibration=views,
+    )  # fmt: skip
 
 
 def sequence_of(

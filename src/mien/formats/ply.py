@@ -180,14 +180,10 @@ def _raw_columns(gaussians: "mien.gaussians.Gaussians", coefficients: int) -> Fl
     # Logits of exactly 0 and 1 are infinite. Logits of +-16.6 give 6e-8 and the float32 next to 1.
     opacities = gaussians.opacities.detach().double().clamp(6e-8, 1 - 6e-8)
     columns = (
-        gaussians.means.detach(),
-        torch.zeros_like(gaussians.means),
-        sh[:, 0],
-        sh[:, 1:].transpose(1, 2).flatten(1),
-        torch.logit(opacities)[:, None],
-        gaussians.scales.detach().double().log(),
+        gaussians.means.detach(), torch.zeros_like(gaussians.means), sh[:, 0], sh[:, 1:].transpose(1, 2).flatten(1),
+        torch.logit(opacities)[:, None], gaussians.scales.detach().double().log(),
         torch.nn.functional.normalize(gaussians.quats.detach(), dim=-1),
-    )
+    )  # fmt: skip
     return torch.cat([column.cpu().float() for column in columns], dim=1).numpy().astype("<f4", order="C", copy=False)
 
 

@@ -71,31 +71,25 @@ _CODES = {
     "avatar.baked.means": _Code(16, "columns", levels=2047),
     "avatar.baked.attributes.quats": _Code(8, "columns", signed=True, levels=63),
     "avatar.baked.attributes.log_scales": _Code(8, "columns"),
-    "avatar.baked.attributes.opacity_logits": _Code(8, "columns"),
-    "avatar.baked.attributes.sh": _Code(8, "columns"),
+    "avatar.baked.attributes.opacity_logits": _Code(8, "columns"), "avatar.baked.attributes.sh": _Code(8, "columns"),
     "avatar.baked.changes.color": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
     "avatar.baked.changes.means": _Code(8, "columns", signed=True, levels=63),
-    "avatar.baked.changes.shares": _Code(8, "columns"),
-    "avatar.baked.changes.features.neutral": _Code(8, "columns"),
+    "avatar.baked.changes.shares": _Code(8, "columns"), "avatar.baked.changes.features.neutral": _Code(8, "columns"),
     "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
     "avatar.baked.changes.features.own": _Code(8, "columns"),
     "avatar.baked.bases.means": _Code(16, "first", signed=True),
     "avatar.baked.bases.log_scales": _Code(8, "columns", signed=True),
     "avatar.baked.bases.opacity_logits": _Code(8, "columns", signed=True),
-    "avatar.baked.bases.sh": _Code(8, "columns", signed=True),
-    "avatar.baked.network.base": _Code(16, "columns"),
+    "avatar.baked.bases.sh": _Code(8, "columns", signed=True), "avatar.baked.network.base": _Code(16, "columns"),
     "avatar.baked.network.along.basis": _Code(8, "columns", signed=True),
-    "avatar.baked.still_weights": _Code(16, "columns", signed=True),
-    "avatar.baked.rig.template": _Code(16, "columns"),
+    "avatar.baked.still_weights": _Code(16, "columns", signed=True), "avatar.baked.rig.template": _Code(16, "columns"),
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True, levels=1023),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
-    "avatar.baked.rig.skinning_weights": _Code(16, "columns", signed=True),
-    "motion.expression": _Code(16, "columns"),
-    "motion.joints": _Code(16, "columns"),
-    "motion.head_rotation": _Code(16, "columns"),
+    "avatar.baked.rig.skinning_weights": _Code(16, "columns", signed=True), "motion.expression": _Code(16, "columns"),
+    "motion.joints": _Code(16, "columns"), "motion.head_rotation": _Code(16, "columns"),
     "motion.head_translation": _Code(16, "columns"),
-}
+}  # fmt: skip
 """Arrays that are not named here are stored as they are; all of them are small."""
 _BLOCKS = 6
 """zlib's memLevel, which decides how much of an array shares one Huffman code. 8, the default, makes packed avatars 2 %
@@ -184,14 +178,9 @@ def bound_features(avatar: PortableAvatar, baked: Static) -> MeshBound | None:
         ),
     )
     return MeshBound(
-        rig=_still_rig(avatar),
-        faces=np.array([[0, 1, 2]], np.int32),
-        face_index=np.zeros(len(baked.means), np.int32),
-        means=baked.means,
-        attributes=baked.attributes,
-        sh_frame="head",
-        changes=changes,
-    )
+        rig=_still_rig(avatar), faces=np.array([[0, 1, 2]], np.int32), face_index=np.zeros(len(baked.means), np.int32),
+        means=baked.means, attributes=baked.attributes, sh_frame="head", changes=changes,
+    )  # fmt: skip
 
 
 def _still_rig(avatar: PortableAvatar) -> Rig:
@@ -201,17 +190,12 @@ def _still_rig(avatar: PortableAvatar) -> Rig:
     weights = np.zeros((3, k), np.float32)
     weights[:, 0] = 1
     return Rig(
-        template=_UNIT_FRAME,
-        expression_names=avatar.expression_names,
-        expression_basis=np.zeros((e, 3, 3), np.float32),
-        joint_names=names,
-        joint_parents=(-1, *(0 for _ in avatar.joint_names)),
-        joint_free=(False, *(True for _ in avatar.joint_names)),
-        joint_template=np.zeros((k, 3), np.float32),
-        joint_rotation_basis=np.zeros((e, k, 3), np.float32),
-        joint_translation_basis=np.zeros((e, k, 3), np.float32),
-        skinning_weights=weights,
-    )
+        template=_UNIT_FRAME, expression_names=avatar.expression_names,
+        expression_basis=np.zeros((e, 3, 3), np.float32), joint_names=names,
+        joint_parents=(-1, *(0 for _ in avatar.joint_names)), joint_free=(False, *(True for _ in avatar.joint_names)),
+        joint_template=np.zeros((k, 3), np.float32), joint_rotation_basis=np.zeros((e, k, 3), np.float32),
+        joint_translation_basis=np.zeros((e, k, 3), np.float32), skinning_weights=weights,
+    )  # fmt: skip
 
 
 def _ordered(baked: MeshBound) -> MeshBound:

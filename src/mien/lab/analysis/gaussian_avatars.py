@@ -54,16 +54,11 @@ def growth(context: Context) -> Result:
     grown, slower = peak / max(start, 1), many / max(few, 1e-9)
     memory, gpu = context.summary["peak_memory_mb"], context.summary.get("gpu_memory_mb")
     values = {
-        "gaussians_start": int(start),
-        "gaussians_peak": int(peak),
-        "gaussians_growth": round(grown, 3),
-        "step_ms_start": round(few, 3),
-        "step_ms_peak": round(many, 3),
-        "step_time_growth": round(slower, 3),
-        "training_peak_memory_mb": memory,
-        "training_gpu_memory_mb": gpu,
+        "gaussians_start": int(start), "gaussians_peak": int(peak), "gaussians_growth": round(grown, 3),
+        "step_ms_start": round(few, 3), "step_ms_peak": round(many, 3), "step_time_growth": round(slower, 3),
+        "training_peak_memory_mb": memory, "training_gpu_memory_mb": gpu,
         "paper": {"gaussians_start": _PAPER_START, "gaussians_end": _PAPER_END, "step_time_growth_at_most": 2.0},
-    }
+    }  # fmt: skip
     rows = (
         ("Gaussians at the start", int(start), _PAPER_START),
         ("Gaussians, most", int(peak), _PAPER_END),

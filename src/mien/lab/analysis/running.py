@@ -187,14 +187,9 @@ def run_analysis(
         folder.mkdir(parents=True, exist_ok=True)
         avatar = file_digest(run_dir / "avatar" / "avatar.safetensors")
         content = {
-            "run": run_dir.name,
-            "method": analysis.method,
-            "paper": analysis.paper,
-            "avatar": avatar,
-            "parts": _known(record, analysis, avatar),
-            "mien": mien.__version__,
-            "command_line": sys.argv,
-        }
+            "run": run_dir.name, "method": analysis.method, "paper": analysis.paper, "avatar": avatar,
+            "parts": _known(record, analysis, avatar), "mien": mien.__version__, "command_line": sys.argv,
+        }  # fmt: skip
         context = Context(run_dir, tuple(sequence_dirs), like_on(choose_device(options.device)), folder, options)
         for part in parts:
             timed = [options.seconds, _native.thread_count()] if part.timed else None

@@ -91,16 +91,13 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
     still = still_timesteps(expected)
     jitter_m = jitter(placed, still)
     return TrackingErrors(
-        vertex_mm=1e3 * float(np.mean(vertex)),
-        landmark_px=float(np.mean(pixel)),
-        rotation_deg=mean,
-        rotation_steady_deg=steady,
-        jitter_px=jitter(projected, still),
+        vertex_mm=1e3 * float(np.mean(vertex)), landmark_px=float(np.mean(pixel)), rotation_deg=mean,
+        rotation_steady_deg=steady, jitter_px=jitter(projected, still),
         jitter_mm=None if jitter_m is None else 1e3 * jitter_m,
         blinks=blink_following(projected, expected, truth, capture.fps),
         turns=turn_following(tracking, truth, capture.fps),
         iris_deviation_percent=residual_report(capture, tracking, face_model)["iris_distance"]["deviation_percent"],
-    )
+    )  # fmt: skip
 
 
 def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) -> Float[np.ndarray, "t c l 2"]:

@@ -116,12 +116,9 @@ def measure_anatomy(model: FaceModel, identity: torch.Tensor) -> Anatomy:
     """Return the anatomy of a person at rest."""
     rest, faces = rest_vertices(model, identity), model.faces.numpy()
     return Anatomy(
-        model=model,
-        vertices=rest,
-        normals=exact.vertex_normals(rest, faces),
-        faces=faces,
+        model=model, vertices=rest, normals=exact.vertex_normals(rest, faces), faces=faces,
         landmarks=landmark_positions(model, rest),
-    )
+    )  # fmt: skip
 
 
 def resample(corners: Float[np.ndarray, "c 3"], points: int) -> Float[np.ndarray, "p 3"]:

@@ -212,18 +212,12 @@ def _make_capture(
 ) -> Capture:
     recipe = scene.recipe
     return Capture(
-        name=recipe.name,
-        camera_ids=recipe.camera_ids,
-        fps=recipe.fps,
-        timestamps=np.array(scene.moments or range(scene.timesteps)) / recipe.fps,
-        images=images,
-        mattes=mattes,
-        landmarks=landmarks,
-        valid=np.isfinite(landmarks[..., 0, 0]),
+        name=recipe.name, camera_ids=recipe.camera_ids, fps=recipe.fps,
+        timestamps=np.array(scene.moments or range(scene.timesteps)) / recipe.fps, images=images, mattes=mattes,
+        landmarks=landmarks, valid=np.isfinite(landmarks[..., 0, 0]),
         principal_point=np.tile(np.array([recipe.width / 2, recipe.height / 2], np.float32), (len(scene.cameras), 1)),
-        source=source,
-        calibration=calibration,
-    )
+        source=source, calibration=calibration,
+    )  # fmt: skip
 
 
 def _detect_landmarks(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:

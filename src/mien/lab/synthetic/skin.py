@@ -93,14 +93,9 @@ def _canvas(anatomy: Anatomy, uv: np.ndarray, size: int) -> tuple[_Canvas, np.nd
     points = values[covered]
     n = len(points)
     canvas = _Canvas(
-        covered=covered,
-        points=np.ascontiguousarray(points[:, :3]),
-        ears=points[:, 3],
-        neck=points[:, 4],
-        height=np.zeros(n, np.float32),
-        albedo=np.zeros((n, 3), np.float32),
-        gloss=np.ones(n, np.float32),
-    )
+        covered=covered, points=np.ascontiguousarray(points[:, :3]), ears=points[:, 3], neck=points[:, 4],
+        height=np.zeros(n, np.float32), albedo=np.zeros((n, 3), np.float32), gloss=np.ones(n, np.float32),
+    )  # fmt: skip
     return canvas, values[..., :3]
 
 

@@ -104,23 +104,12 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     faces, materials = _all_faces(anatomy, kept, hair, glasses, shirt)
     occluders = _occluders(anatomy, scalp, glasses, shirt) if recipe.detail.shadows else None
     return Subject(
-        model=model,
-        poser=HeadPoser(model, identity),
-        anatomy=anatomy,
-        textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
-        lighting=studio_lighting(seed),
-        visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders),
-        eyes=eyes,
-        iris_color=_color(random, "iris"),
-        wet_eyes=recipe.detail.wet_eyes,
-        shirt_color=_color(random, "shirt"),
-        hair=tuple(hair),
-        glasses=glasses,
-        shirt=shirt,
-        faces=faces,
-        materials=materials,
-        model_faces=kept,
-    )
+        model=model, poser=HeadPoser(model, identity), anatomy=anatomy,
+        textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color), lighting=studio_lighting(seed),
+        visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders), eyes=eyes,
+        iris_color=_color(random, "iris"), wet_eyes=recipe.detail.wet_eyes, shirt_color=_color(random, "shirt"),
+        hair=tuple(hair), glasses=glasses, shirt=shirt, faces=faces, materials=materials, model_faces=kept,
+    )  # fmt: skip
 
 
 def _color(random: np.random.Generator, of: str) -> Float[np.ndarray, " 3"]:
