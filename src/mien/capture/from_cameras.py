@@ -50,13 +50,9 @@ class _View:
 
 
 def capture_cameras(
-    sources: Sequence[Path],
-    calibration: Path,
-    out: Path,
-    name: str,
-    settings: CaptureSettings | None = None,
+    sources: Sequence[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings | None = None,
     replace_others: bool = False,
-) -> Capture:
+) -> Capture:  # fmt: skip
     """Capture a head that several calibrated cameras filmed at the same time, as one capture into the folder `out`.
 
     Frame n of all videos is the same moment, after the offsets of the calibration file. The head's path is found from
@@ -238,14 +234,9 @@ def _readings(views: list[_View], parts: Sequence[Part] = ()) -> list[readings.R
 
 
 def _finish(
-    views: list[_View],
-    whole: from_video.CaptureJob,
-    path: HeadPath,
-    parts: list[Part],
-    layout: FrameLayout,
-    chunks: list[list[Chunk]],
-    out: Path,
-) -> None:
+    views: list[_View], whole: from_video.CaptureJob, path: HeadPath, parts: list[Part], layout: FrameLayout,
+    chunks: list[list[Chunk]], out: Path,
+) -> None:  # fmt: skip
     cameras = tuple(_cropped(view.camera, part.crop) for view, part in zip(views, parts, strict=True))
     landmarks = join_chunks(chunks, "landmarks")
     readings.warn_of_misfit(readings.rank_readings(landmarks, _readings(views, parts)))

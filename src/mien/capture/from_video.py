@@ -118,12 +118,9 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
 
 
 def capture_video_parts(
-    source: Path,
-    sequences: Path,
-    settings: CaptureSettings | None = None,
-    name: str | None = None,
+    source: Path, sequences: Path, settings: CaptureSettings | None = None, name: str | None = None,
     replace: bool = False,
-) -> list[Capture]:
+) -> list[Capture]:  # fmt: skip
     """Capture a video into `sequences`/NAME/capture, or, if it has cuts, each shot into NAME-1, NAME-2, ...
 
     Each part is captured as by `capture_video`. The source is read only twice, however many parts there are. The

@@ -130,12 +130,9 @@ def check_replaceable(path: Path) -> None:
 
 
 def finish_capture(
-    layout: frame_files.FrameLayout,
-    path: Path,
-    capture: Capture,
-    digests: dict[str, np.ndarray],
+    layout: frame_files.FrameLayout, path: Path, capture: Capture, digests: dict[str, np.ndarray],
     report: dict[str, Any] | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """Write the files beside the frames, which are in the layout's folder, rename it to `path` and return the hash."""
     folder = layout.folder
     arrays = _arrays(capture, digests)

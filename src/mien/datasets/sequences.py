@@ -28,15 +28,9 @@ _LANDMARKS = "mediapipe"
 
 @torch.no_grad()
 def tracked_sequence(
-    path: Path,
-    name: str,
-    images: UInt8[np.ndarray, "t c h w 3"],
-    mattes: UInt8[np.ndarray, "t c h w"],
-    cameras: Mapping[str, Camera],
-    face_model: FaceModel,
-    face: FaceParams,
-    fps: float,
-) -> TrackedSequence:
+    path: Path, name: str, images: UInt8[np.ndarray, "t c h w 3"], mattes: UInt8[np.ndarray, "t c h w"],
+    cameras: Mapping[str, Camera], face_model: FaceModel, face: FaceParams, fps: float,
+) -> TrackedSequence:  # fmt: skip
     """Return a sequence whose every frame is tracked.
 
     Landmarks are those of the face model, projected, because no dataset has the points of mien's detector. Residuals
@@ -71,14 +65,9 @@ def tracked_sequence(
 
 
 def filmed_sequence(
-    path: Path,
-    name: str,
-    images: UInt8[np.ndarray, "t c h w 3"],
-    mattes: UInt8[np.ndarray, "t c h w"],
-    cameras: Mapping[str, Camera],
-    fps: float,
-    landmarks: Float[np.ndarray, "t c l 2"] | None = None,
-) -> FilmedSequence:
+    path: Path, name: str, images: UInt8[np.ndarray, "t c h w 3"], mattes: UInt8[np.ndarray, "t c h w"],
+    cameras: Mapping[str, Camera], fps: float, landmarks: Float[np.ndarray, "t c l 2"] | None = None,
+) -> FilmedSequence:  # fmt: skip
     """Return a sequence without a tracking, for `mien track`: the arguments are those of `tracked_sequence`.
 
     `landmarks` are the 478 points of mien's detector in pixels, or None to detect them. A face with NaN is not valid.

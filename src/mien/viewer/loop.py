@@ -38,12 +38,9 @@ class DrawingLoop:
     """Draws one picture at a time, for the client that has waited longest."""
 
     def __init__(
-        self,
-        draw: Callable[[View, bool], Any],
-        advance: Callable[[float], float | None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        failed: Callable[[Exception], None] = lambda error: None,
-    ) -> None:
+        self, draw: Callable[[View, bool], Any], advance: Callable[[float], float | None] | None = None,
+        clock: Callable[[], float] = time.monotonic, failed: Callable[[Exception], None] = lambda error: None,
+    ) -> None:  # fmt: skip
         """Make a loop that is not running yet.
 
         `draw` returns the picture of a view, of half size or full size. `advance` is called before each picture with

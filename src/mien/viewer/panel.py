@@ -29,14 +29,9 @@ class Panel:
     """The controls of one session."""
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        session: Session,
-        title: str,
-        view_of: Callable[..., View],
-        failed: Callable[[Exception], None],
-        camera: CameraSwitch | None = None,
-    ) -> None:
+        self, server: viser.ViserServer, session: Session, title: str, view_of: Callable[..., View],
+        failed: Callable[[Exception], None], camera: CameraSwitch | None = None,
+    ) -> None:  # fmt: skip
         """Add the controls to a server.
 
         `title` names the avatar, for people and for the files that are saved; `view_of` returns the view of a client's

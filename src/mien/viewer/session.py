@@ -48,11 +48,9 @@ class Session:
     """An avatar with its face, its motion, and what is drawn of it."""
 
     def __init__(
-        self,
-        avatar: runtime.Avatar,
-        mesh: drawing.Mesh | None = None,
+        self, avatar: runtime.Avatar, mesh: drawing.Mesh | None = None,
         clips: Mapping[str, Callable[[], Clip]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Show an avatar at rest. Each of the motions, which have names, is loaded at its first use."""
         self.avatar, self.mesh = avatar, mesh
         self._makers, self._clips = dict(clips or {}), dict[str, Clip]()

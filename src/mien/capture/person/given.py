@@ -29,12 +29,8 @@ class GivenMattes:
     """Mattes of a source's frames, read once and in order."""
 
     def __init__(
-        self,
-        path: Path,
-        picture_size: tuple[int, int],
-        lens: Lens | None = None,
-        own: FrameSource | None = None,
-    ) -> None:
+        self, path: Path, picture_size: tuple[int, int], lens: Lens | None = None, own: FrameSource | None = None,
+    ) -> None:  # fmt: skip
         """Prepare to read a video or a folder. `own` is the source itself, if its alpha is the matte."""
         self._path, self._lens = path, lens
         self._size, self._is_own = picture_size, own is not None

@@ -139,12 +139,9 @@ PrepareMatte = Callable[[int, UInt8[np.ndarray, "h w 3"]], MakeMatte]
 
 
 def choose_matting(
-    stack: ExitStack,
-    crop: Crop,
-    plate: UInt8[np.ndarray, "h w 3"] | None,
-    mattes: GivenMattes | None,
+    stack: ExitStack, crop: Crop, plate: UInt8[np.ndarray, "h w 3"] | None, mattes: GivenMattes | None,
     detector: DetectorChoice = "auto",
-) -> PrepareMatte:
+) -> PrepareMatte:  # fmt: skip
     """Return the matting that the user's inputs allow. `stack` closes whatever is opened."""
     if mattes is not None:
 

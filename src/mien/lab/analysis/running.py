@@ -120,13 +120,9 @@ class Context(Run):
         return replace(self.settings, steps=self.options.steps, device=device)
 
     def train(
-        self,
-        name: str,
-        config: MethodConfig,
-        face_model: FaceModel | None = None,
-        resolution: int | None = None,
+        self, name: str, config: MethodConfig, face_model: FaceModel | None = None, resolution: int | None = None,
         timesteps: Sequence[Bool[Tensor, " t"]] | None = None,
-    ) -> Run:
+    ) -> Run:  # fmt: skip
         """Train the run's sequences again for `options.steps` steps, with something changed.
 
         A stopped training continues, and a finished one is only read. `resolution` is the longer side of the training
@@ -161,13 +157,9 @@ class Context(Run):
 
 
 def run_analysis(
-    analysis: Analysis,
-    parts: Sequence[Part],
-    run_dir: Path,
-    sequence_dirs: Sequence[Path],
-    folder: Path,
+    analysis: Analysis, parts: Sequence[Part], run_dir: Path, sequence_dirs: Sequence[Path], folder: Path,
     options: AnalysisOptions,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Run some parts of an analysis on a finished run, and return the content of analysis.json.
 
     A part that was computed before, for the same avatar and options, is kept. Each part is written once it is done.

@@ -111,11 +111,9 @@ def _means(
 
 
 def _lines(
-    capture: str,
-    protocol: str,
-    rows: Sequence[tuple[str, dict[str, float | None]]],
+    capture: str, protocol: str, rows: Sequence[tuple[str, dict[str, float | None]]],
     columns: Sequence[tuple[str, str, int, bool]],
-) -> list[Sequence[str]]:
+) -> list[Sequence[str]]:  # fmt: skip
     """Rows of one group. The best quality is bold if several rows have the figure."""
     best: dict[str, str] = {}
     for name, _, digits, higher in _QUALITY:

@@ -100,11 +100,8 @@ def _lens(rim: Float[np.ndarray, "p 3"], side: float) -> RigidMesh:
 
 
 def build_shirt(
-    neck: Float[np.ndarray, " 3"],
-    neck_size: tuple[float, float],
-    shoulder_points: Float[np.ndarray, "p 3"],
-    seed: int,
-) -> RigidMesh:
+    neck: Float[np.ndarray, " 3"], neck_size: tuple[float, float], shoulder_points: Float[np.ndarray, "p 3"], seed: int,
+) -> RigidMesh:  # fmt: skip
     """Build shoulders in a shirt with a round collar, which covers the shoulders' points.
 
     `neck` is the middle of the neck at the height of the collar, `neck_size` its half width and half depth there.

@@ -203,13 +203,9 @@ class Pictures:
 
 
 def _make_capture(
-    scene: SyntheticScene,
-    images: np.ndarray,
-    mattes: np.ndarray,
-    landmarks: np.ndarray,
-    source: dict,
+    scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, landmarks: np.ndarray, source: dict,
     calibration: tuple[Camera, ...] | None,
-) -> Capture:
+) -> Capture:  # fmt: skip
     recipe = scene.recipe
     return Capture(
         name=recipe.name, camera_ids=recipe.camera_ids, fps=recipe.fps,

@@ -284,11 +284,9 @@ def _expression(model: FaceModel, tracks: _Tracks, timesteps: int) -> Float[torc
 
 
 def _joints(
-    model: FaceModel,
-    rotations: Float[np.ndarray, "t 3 3"],
-    head_rotation: Float[np.ndarray, "t 3"],
+    model: FaceModel, rotations: Float[np.ndarray, "t 3 3"], head_rotation: Float[np.ndarray, "t 3"],
     gaze: Float[np.ndarray, "t 2"],
-) -> Float[torch.Tensor, "t j 3"]:
+) -> Float[torch.Tensor, "t j 3"]:  # fmt: skip
     joints = np.zeros((len(gaze), len(model.free_joint_names), 3))
     shoulders = shoulder_rotation(head_rotation)
     for column, name in enumerate(model.free_joint_names):

@@ -40,14 +40,10 @@ class SyntheticScene:
     """A person in motion in front of a camera. Recipe and seeds decide everything."""
 
     def __init__(
-        self,
-        recipe: SyntheticRecipe,
-        seed: int,
-        motion_seed: int | None = None,
-        same_person: "SyntheticScene | None" = None,
-        moments: Sequence[int] | None = None,
+        self, recipe: SyntheticRecipe, seed: int, motion_seed: int | None = None,
+        same_person: "SyntheticScene | None" = None, moments: Sequence[int] | None = None,
         faces: Sequence[Mapping[str, float]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Prepare a scene; nothing is drawn yet.
 
         `seed` decides the person, the light and the room, `motion_seed` the motion; None for `seed`. A scene with the

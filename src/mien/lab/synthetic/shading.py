@@ -213,11 +213,9 @@ def turn_light(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> Lo
 
 
 def shade_highlights(
-    normals: Float[np.ndarray, "n 3"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
+    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight,
     lobes: tuple[tuple[float, float], ...],
-) -> Float[np.ndarray, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Return the specular part of the lamps' light.
 
     Each lobe has a weight and a sharpness. It is normalised, so that a sharper lobe is brighter and smaller.
@@ -235,12 +233,9 @@ def shade_highlights(
 
 
 def shade_skin(
-    channels: Float[np.ndarray, "n 7"],
-    normals: Float[np.ndarray, "n 3"],
-    shadow: Float[np.ndarray, "n 3"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
-) -> Float[np.ndarray, "n 3"]:
+    channels: Float[np.ndarray, "n 7"], normals: Float[np.ndarray, "n 3"], shadow: Float[np.ndarray, "n 3"],
+    views: Float[np.ndarray, "n 3"], light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade skin: diffuse light that bleeds red into shadows, and an oily sheen."""
     albedo, gradient, gloss = channels[:, :3], channels[:, 3:6], channels[:, 6:7]
     normals = unit(unit(normals) - gradient)
@@ -274,14 +269,10 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
 
 
 def shade_eye(
-    local: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    axis: Float[np.ndarray, " 3"],
-    under_lid: Float[np.ndarray, " n"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
+    local: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, " 3"],
+    under_lid: Float[np.ndarray, " n"], views: Float[np.ndarray, "n 3"], light: LocalLight,
     iris: tuple[float, np.ndarray, bool],
-) -> Float[np.ndarray, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade an eye: white with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
 
     `local` are directions from the eyeball's centre, +z along the line of sight; `normals` the same and `axis` the line
@@ -324,12 +315,9 @@ def _fibres(turn: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def shade_teeth(
-    rest: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
-) -> Float[np.ndarray, "n 3"]:
+    rest: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"],
+    views: Float[np.ndarray, "n 3"], light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade teeth: off-white, with a gap every 8 mm along the arch.
 
     `depth` is the distance behind the foremost tooth in metres; deeper teeth get less light.
@@ -349,11 +337,9 @@ def shade_teeth(
 
 
 def shade_mouth(
-    normals: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    views: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"], views: Float[np.ndarray, "n 3"],
     light: LocalLight,
-) -> Float[np.ndarray, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade the mouth as wet dark flesh: gums, tongue, the inside of the cheeks."""
     scarce = np.exp(-np.clip(depth - 0.006, 0, None) / 0.012)[:, None]
     albedo = np.array([0.34, 0.085, 0.075], np.float32)

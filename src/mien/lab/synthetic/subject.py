@@ -212,12 +212,8 @@ def _occluders(
 
 
 def _all_faces(
-    anatomy: Anatomy,
-    kept: np.ndarray,
-    hair: Sequence[Hair],
-    glasses: Glasses | None,
-    shirt: RigidMesh | None,
-) -> tuple[np.ndarray, np.ndarray]:
+    anatomy: Anatomy, kept: np.ndarray, hair: Sequence[Hair], glasses: Glasses | None, shirt: RigidMesh | None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the triangles over `opaque_vertices` and their materials."""
     of_model = np.full(len(anatomy.faces), int(Material.SKIN))
     of_model[anatomy.region("eyes", "irises")] = Material.EYE
