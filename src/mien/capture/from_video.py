@@ -235,11 +235,8 @@ def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_
     own = asdict(settings) | contents
     del own["detector"]
     content = {
-        "recipe": RECIPE,
-        "source": frames.content_hash,
-        "name": name,
-        "settings": own | detector_entry(detector),
-    }
+        "recipe": RECIPE, "source": frames.content_hash, "name": name, "settings": own | detector_entry(detector),
+    }  # fmt: skip
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     return CaptureJob(frames, settings, name, key, replace_others, detector)
 

@@ -71,10 +71,8 @@ def _read_capture(path: Path) -> Capture:
     if not path.is_dir():
         raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
     check_tree(path)
-    content, arrays = (
-        read_json(path / JSON_NAME, FORMAT, VERSION, frame_files.STAGE),
-        read_arrays(path / ARRAYS_NAME, frame_files.STAGE),
-    )
+    content = read_json(path / JSON_NAME, FORMAT, VERSION, frame_files.STAGE)
+    arrays = read_arrays(path / ARRAYS_NAME, frame_files.STAGE)
     with expect_whole(path / JSON_NAME, frame_files.REMEDY):
         _check(content, arrays)
         camera_ids = tuple(content["camera_ids"])
@@ -152,13 +150,10 @@ def finish_capture(
 
 def _arrays(capture: Capture, digests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     arrays = {
-        "timestamps": capture.timestamps,
-        "landmarks": capture.landmarks,
-        "valid": capture.valid,
-        "principal_point": capture.principal_point,
-        "frame_digests": digests[frame_files.FRAMES],
+        "timestamps": capture.timestamps, "landmarks": capture.landmarks, "valid": capture.valid,
+        "principal_point": capture.principal_point, "frame_digests": digests[frame_files.FRAMES],
         "matte_digests": digests[frame_files.MATTES],
-    }
+    }  # fmt: skip
     if capture.calibration is not None:
         arrays["K"] = np.stack([camera.K.numpy() for camera in capture.calibration])
         arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in capture.calibration])

@@ -71,11 +71,9 @@ def _survey(path: Path) -> Findings:
     if "test" not in clips:
         missing.append("transforms_test.json")
     return Findings(
-        tuple(Clip(name, len(frames)) for name, frames in clips.items()),
-        None,
-        "the clip test is held out" if "test" in clips else None,
-        tuple(missing),
-    )
+        tuple(Clip(name, len(frames)) for name, frames in clips.items()), None,
+        "the clip test is held out" if "test" in clips else None, tuple(missing),
+    )  # fmt: skip
 
 
 def _plates(path: Path) -> list[Path]:

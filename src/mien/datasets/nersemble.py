@@ -131,13 +131,11 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         if unknown:
             raise UserError(f"{path / CALIBRATION}: has no camera {unknown[0]}, of which {name} has a video; {REMEDY}")
         yield Footage(
-            name,
-            tuple(videos.values()),
-            {serial: cameras[serial] for serial in videos},
+            name, tuple(videos.values()), {serial: cameras[serial] for serial in videos},
             clean_plates=_plates(path, videos),
             color_corrections=partial(_corrections, path, tuple(videos)) if is_file_inside(path, colors) else None,
             stride=_STRIDE,
-        )
+        )  # fmt: skip
 
 
 def _corrections(path: Path, serials: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -106,10 +106,8 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
         "means": stacked(columns, ["x", "y", "z"], path),
         "quats": stacked(columns, [f"rot_{i}" for i in range(4)], path),
         "log_scales": stacked(columns, [f"scale_{i}" for i in range(3)], path),
-        "opacity_logits": stacked(columns, ["opacity"], path)[:, 0],
-        "sh_constant": sh[:, :1],
-        "sh_rest": sh[:, 1:],
-    }
+        "opacity_logits": stacked(columns, ["opacity"], path)[:, 0], "sh_constant": sh[:, :1], "sh_rest": sh[:, 1:],
+    }  # fmt: skip
     for name, array in state.items():
         if not is_moderate(array):
             raise UserError(f"{path}: {name} holds NaN or numbers beyond {MAX_NUMBER:g}; export it again")

@@ -205,11 +205,9 @@ def _mesh_content(
         "WEIGHTS_0": writer.accessor(weights[points], VERTICES),
     }
     primitive = {
-        "attributes": attributes,
-        "indices": writer.accessor(index.reshape(-1).astype("<u4"), INDICES),
-        "material": 0,
+        "attributes": attributes, "indices": writer.accessor(index.reshape(-1).astype("<u4"), INDICES), "material": 0,
         "targets": [{"POSITION": writer.sparse(moved[points])} for moved in targets.values()],
-    }
+    }  # fmt: skip
     mesh = {"name": "head", "primitives": [primitive], "extras": {"targetNames": list(targets)}}
     if targets:
         mesh["weights"] = [0.0] * len(targets)
@@ -243,10 +241,8 @@ def _skin(writer: GlbWriter, rig: Rig, face: Face, first_node: int) -> dict[str,
     inverse[:, 3, :3] = -positions  # column by column
     return {
         "inverseBindMatrices": writer.accessor(inverse.reshape(-1, 16)),
-        "joints": list(range(first_node, first_node + len(nodes))),
-        "skeleton": first_node,
-        "nodes": nodes,
-    }
+        "joints": list(range(first_node, first_node + len(nodes))), "skeleton": first_node, "nodes": nodes,
+    }  # fmt: skip
 
 
 def _add_texture(writer: GlbWriter, content: dict[str, Any], texture: Float32[np.ndarray, "s s 3"]) -> None:

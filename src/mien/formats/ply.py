@@ -240,13 +240,10 @@ def _activated(
         return torch.from_numpy(stacked(columns, list(names), path))
 
     gaussians = Gaussians(
-        means=read("x", "y", "z"),
-        quats=read(*(f"rot_{i}" for i in range(4))),
-        scales=read(*(f"scale_{i}" for i in range(3))).exp(),
-        opacities=torch.sigmoid(read("opacity")[:, 0]),
-        sh=torch.from_numpy(stacked_sh(columns, path)),
-        T_world_local=None if pose is None else torch.from_numpy(pose),
-    )
+        means=read("x", "y", "z"), quats=read(*(f"rot_{i}" for i in range(4))),
+        scales=read(*(f"scale_{i}" for i in range(3))).exp(), opacities=torch.sigmoid(read("opacity")[:, 0]),
+        sh=torch.from_numpy(stacked_sh(columns, path)), T_world_local=None if pose is None else torch.from_numpy(pose),
+    )  # fmt: skip
     for word, name in _WORDS.items():
         if not getattr(gaussians, name).isfinite().all():
             raise UserError(f"{path}: the {word} of some Gaussians is NaN or infinite; export it again, or clean it up")

@@ -36,7 +36,7 @@ _OWN = (
     Format("ply", "pose", _of("ply:write"), (".ply",), options=_of("ply:PlyOptions")),
     Format("spz", "pose", _of("spz:write"), (".spz",), options=_of("spz:SpzOptions")),
     Format("sog", "pose", _of("sog:write"), (".sog",), options=SplatOptions),
-    Format("usd", "sequence", _of("usd:write"), _USD, check=_of("usd:check_usd_options")),
+    Format("usd", "sequence", _of("usd:write"), _USD, check=_of("usd:check_usd")),
     Format("gaussian-avatars", "folder", _of("gaussian_avatars:write"), options=NoOptions),
 )
 

@@ -57,14 +57,11 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
         "sh0.webp": _picture(np.concatenate([color_codes, alpha[:, None]], axis=1), width),
     }
     meta: dict[str, Any] = {
-        "version": _VERSION,
-        "count": len(means),
-        "antialias": False,
+        "version": _VERSION, "count": len(means), "antialias": False,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scale_book, "files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
+        "scales": {"codebook": scale_book, "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_book, "files": ["sh0.webp"]},
-    }
+    }  # fmt: skip
     if sh.shape[1] > 1:
         meta["shN"] = _add_palette(pictures, sh[:, 1:], width)
     members = {"meta.json": json.dumps(meta, allow_nan=False).encode(), **pictures}
@@ -133,12 +130,9 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
         palette = pixels("shN", 0, 3).reshape(-1, rest, 3)
         sh = np.concatenate([sh, book("shN")[palette[labels]]], axis=1)
     return (
-        np.sign(logged) * np.expm1(np.abs(logged)),
-        _unpacked_quats(pixels("quats", 0, 4)),
-        np.exp(book("scales", np.float64)[pixels("scales", 0, 3)]),
-        shades[:, 3] / 255,
-        sh,
-    )
+        np.sign(logged) * np.expm1(np.abs(logged)), _unpacked_quats(pixels("quats", 0, 4)),
+        np.exp(book("scales", np.float64)[pixels("scales", 0, 3)]), shades[:, 3] / 255, sh,
+    )  # fmt: skip
 
 
 def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:

@@ -27,14 +27,10 @@ _MAX_BYTES = 1 << 28
 _REMEDY = "give a USD file of `mien export`"
 
 
-def check_usd_options(path: Path, options: PoseOptions) -> None:
-    """Check the options, and that usd-core is installed."""
-    check_options(path, options)
-    check_usd(path)
-
-
-def check_usd(path: Path) -> None:
-    """Check that usd-core, which writes and reads `path`, is installed."""
+def check_usd(path: Path, options: PoseOptions | None = None) -> None:
+    """Check the options, if any, and that usd-core, which writes and reads `path`, is installed."""
+    if options is not None:
+        check_options(path, options)
     if importlib.util.find_spec("pxr") is None:
         raise UserError(f"{path}: needs the package usd-core, which is missing; run `pip install 'mien[usd]'`")
 

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
-from mien.camera import Box
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -300,24 +299,20 @@ def _image(experiment: Experiment, frame: Frame, kept: Bool[Tensor, " n"] | None
     return rasterize(gaussians, experiment.camera(frame), torch.ones(3)).image.clamp(0, 1)
 
 
-def _box_of(experiment: Experiment, frame: Frame, model: FaceModel) -> Box:
-    return mouth_box(model, experiment.face(frame), experiment.camera(frame))
-
-
 def _mouth_psnr(
     experiment: Experiment, frames: Sequence[Frame], model: FaceModel, kept: Bool[Tensor, " n"] | None = None
 ) -> float:
     """The mean PSNR of the mouth, whose place is that of `model`: one without teeth would have another box."""
-    values = [
-        psnr(_image(experiment, frame, kept), target_image(experiment, frame), _box_of(experiment, frame, model))
-        for frame in frames
-    ]
+    values = []
+    for frame in frames:
+        box = mouth_box(model, experiment.face(frame), experiment.camera(frame))
+        values.append(psnr(_image(experiment, frame, kept), target_image(experiment, frame), box))
     return round(sum(values) / len(values), 3)
 
 
 def _beside_truth(experiment: Experiment, frame: Frame, kept: Bool[Tensor, " n"], index: int) -> Picture:
     images = (target_image(experiment, frame), _image(experiment, frame, None), _image(experiment, frame, kept))
-    box = _box_of(experiment, frame, experiment.avatar.face_model)
+    box = mouth_box(experiment.avatar.face_model, experiment.face(frame), experiment.camera(frame))
     cut = [crop_to(image, box) for image in images]
     # At the size of the other pictures, without smoothing.
     rows, columns = (torch.arange(_SIDE) * size // _SIDE for size in cut[0].shape[:2])

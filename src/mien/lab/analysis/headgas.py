@@ -137,12 +137,9 @@ def basis(context: Context) -> Result:
     write_video(context.folder / "basis.mp4", film(), _FPS)
     seen = sum(row[2] >= 0.5 * row[1] for row in rows if row[1] > 0)
     columns = {
-        "name": "Expression",
-        "value": "Drawn at",
-        "largest_in_training": "Largest in training",
-        "picture_change": "Change of the picture, of 255",
-        "mesh_moves_mm": "Mesh moves at most, mm",
-    }
+        "name": "Expression", "value": "Drawn at", "largest_in_training": "Largest in training",
+        "picture_change": "Change of the picture, of 255", "mesh_moves_mm": "Mesh moves at most, mm",
+    }  # fmt: skip
     base = "added to the person at rest" if added else "alone"
     caption = f"The 12 expressions that training reached farthest, each {base}: the mesh, and the avatar."
     grid = picture_grid([pair(index, rows[index][1], "g") for index in shown], 3)

@@ -193,12 +193,10 @@ def diversity(context: Context) -> Result:
     """The same short training on all frames, on two clips by time as in the paper, and on two choices by pose: A.4."""
     measured = measure(context.sequences, training_frames(context.sequences, context.settings))
     subsets = {
-        "all frames": list(range(len(measured.timesteps))),
-        "frontal clip": clip(measured, 0.25, mixed=False),
-        "mixed clip": clip(measured, 0.5, mixed=True),
-        "frontal quarter": frontal_quarter(measured),
+        "all frames": list(range(len(measured.timesteps))), "frontal clip": clip(measured, 0.25, mixed=False),
+        "mixed clip": clip(measured, 0.5, mixed=True), "frontal quarter": frontal_quarter(measured),
         "mixed half": mixed_half(measured),
-    }
+    }  # fmt: skip
     context.say_how_long("diversity", len(subsets))
     runs, rows, (metric, notes) = {}, [], measuring.perceptual_metric()
     for name, chosen in subsets.items():

@@ -133,6 +133,11 @@ def _lines(
     return lines
 
 
+def known(value: float | None, form: str = "{:.3f}") -> str:
+    """A figure for a table; "-" if there is none."""
+    return "-" if value is None else form.format(value)
+
+
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in markdown. Each line ends with a line break."""
     lines = [" | ".join(heads), *(" | ".join(row) for row in rows)]

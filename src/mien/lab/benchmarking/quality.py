@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.lab.benchmarking.comparing import markdown
+from mien.lab.benchmarking.comparing import known, markdown
 from mien.lab.synthetic.truth import Truth
 from mien.machine import exact
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
@@ -314,14 +314,14 @@ def unseen_table(name: str, views: dict[str, Any]) -> str:
     rows = []
     for angle, row in views.items():
         crops = [row[what]["head"] for what in ("avatar", "mesh")]
-        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {_known(head['perceptual'], '{:.3f}')}" for head in crops]
+        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {known(head['perceptual'])}" for head in crops]
         rows.append((angle, *cells))
     return markdown(heads, rows)
 
 
 def tracking_cells(errors: TrackingErrors) -> list[str]:
     """Return the figures of one sequence as cells of a table."""
-    pixels, world = _known(errors.jitter_px, "{:.3f} px"), _known(errors.jitter_mm, "{:.3f} mm")
+    pixels, world = known(errors.jitter_px, "{:.3f} px"), known(errors.jitter_mm, "{:.3f} mm")
     return [
         f"{errors.vertex_mm:.2f} mm", f"{errors.landmark_px:.2f} px",
         f"{errors.rotation_deg:.2f} ({errors.rotation_steady_deg:.2f}) deg",
@@ -330,14 +330,10 @@ def tracking_cells(errors: TrackingErrors) -> list[str]:
             "-" if one is None else f"{one.lag_frames:.2f} frames, {one.loss_percent:.0f} % ({one.events})"
             for one in (errors.blinks, errors.turns)
         ),
-        _known(errors.iris_deviation_percent, "{:.2f} %"),
+        known(errors.iris_deviation_percent, "{:.2f} %"),
     ]  # fmt: skip
 
 
-def _known(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
 def _figures(entry: dict[str, Any]) -> str:
-    last = _known(entry.get("perceptual"), "{:.3f}")
+    last = known(entry.get("perceptual"))
     return f"{entry['psnr']:.2f} / {entry['ssim']:.3f} / {entry['l1']:.4f} / {last}"

@@ -241,8 +241,6 @@ class Lashes:
                 outwards.append(np.repeat(radial[:, None], steps, 1))
                 widths.append(np.repeat((0.0003 if curl > 0 else 0.00016) * np.linspace(1, 0.4, steps)[None], count, 0))
         return Strands(
-            np.concatenate(points).astype(np.float32),
-            np.concatenate(widths).astype(np.float32),
-            np.full((sum(map(len, points)), steps, 3), 0.012, np.float32),
-            np.concatenate(outwards).astype(np.float32),
-        )
+            np.concatenate(points).astype(np.float32), np.concatenate(widths).astype(np.float32),
+            np.full((sum(map(len, points)), steps, 3), 0.012, np.float32), np.concatenate(outwards).astype(np.float32),
+        )  # fmt: skip

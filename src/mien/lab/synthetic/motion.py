@@ -208,12 +208,10 @@ def generate_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticR
     anchor = np.array([0.0, 0.0, -recipe.distance]) + pivot + sway
     head_rotation = axis_angle_from_matrix(rotations)
     return FaceParams(
-        identity=identity,
-        expression=_expression(model, tracks, len(times)),
-        joints=_joints(model, rotations, head_rotation, gaze),
-        head_rotation=torch.from_numpy(head_rotation).float(),
+        identity=identity, expression=_expression(model, tracks, len(times)),
+        joints=_joints(model, rotations, head_rotation, gaze), head_rotation=torch.from_numpy(head_rotation).float(),
         head_translation=torch.from_numpy(anchor - exact.dot(rotations, pivot)).float(),
-    )
+    )  # fmt: skip
 
 
 def shoulder_rotation(head_rotation: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:

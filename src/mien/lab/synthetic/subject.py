@@ -128,11 +128,9 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
     centers = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
     pose = HeadPose(head, normals, landmarks, centers, _shoulders(subject, face, R))
     return PosedSubject(
-        **vars(pose),
-        strands=tuple(hair.posed(pose) for hair in subject.hair),
-        R_world_head=R,
+        **vars(pose), strands=tuple(hair.posed(pose) for hair in subject.hair), R_world_head=R,
         viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
-    )
+    )  # fmt: skip
 
 
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
