@@ -49,8 +49,7 @@ def tree_bytes(folder: Path) -> dict[str, bytes]:
 
 def scan_texture(test_data: Path) -> np.ndarray:
     """Return the photo texture of the Lee Perry-Smith scan: a flat, frontal face that the detectors find."""
-    path = test_data / "leeperrysmith" / "Map-COL.jpg"
-    texture = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    texture = cv2.imread(str(test_data / "leeperrysmith" / "Map-COL.jpg"), cv2.IMREAD_COLOR_RGB)
     assert texture is not None
     return texture
 

@@ -40,8 +40,7 @@ def filmed(picture: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     back, light = np.linalg.inv(matrix[:, :3]).T, aims.copy()
     for _ in range(15):
         light += (aims - polynomial(light, matrix)) @ back
-    seen = np.rint(255 * to_srgb(light)).astype(np.uint8)
-    return seen[places.reshape(picture.shape[:2])]
+    return np.rint(255 * to_srgb(light)).astype(np.uint8)[places.reshape(picture.shape[:2])]
 
 
 def correction(seed: int, terms: int = 20) -> np.ndarray:

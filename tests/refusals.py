@@ -18,9 +18,12 @@ def refuses(words: str, call: Callable[..., Any], *given: Any, **named: Any) -> 
     return line
 
 
-def complaint(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    """Run a command that must be refused in one line, and return the line."""
+def complaint(capsys: pytest.CaptureFixture[str], *words: object, alone: bool = True) -> str:
+    """Run a command that must be refused in one line, alone or after what it says of its work; return the line."""
     capsys.readouterr()
     assert main(list(map(str, words))) == EXIT_USER_ERROR
-    (line,) = (text for text in capsys.readouterr().err.splitlines() if text.startswith("mien: "))
+    (line,) = (
+        text for text in capsys.readouterr().err.splitlines() if text.strip() and (alone or text.startswith("mien: "))
+    )
+    assert line.startswith("mien: ")
     return line

@@ -142,8 +142,7 @@ def test_corrections_of_the_pose_are_averaged_over_time() -> None:
     slow = torch.linspace(0, 0.01, 12)[:, None] * torch.tensor([1.0, -1.0, 0.5])
     trembling = torch.tensor([1.0, -1.0]).repeat(6)[:, None] * torch.tensor([0.002, 0.001, 0.003])
     moved = replace(tracked, head_translation=tracked.head_translation + slow, expression=tracked.expression / 2)
-    shaken = replace(moved, head_translation=moved.head_translation + trembling)
-    for one in (moved, shaken):
+    for one in (moved, replace(moved, head_translation=moved.head_translation + trembling)):
         found = steadier(tracked, one, torch.arange(12) >= 0)
         assert torch.allclose(found.head_translation[1:-1], moved.head_translation[1:-1], atol=2e-4)
         assert torch.allclose(found.T_world_head[:, :3, :3], tracked.T_world_head[:, :3, :3], atol=1e-6)

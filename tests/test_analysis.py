@@ -32,6 +32,7 @@ from mien.machine import devices
 from mien.pages.pages import Axes, Series
 from mien.training import checkpoint
 from mien.training.run import read_curves, read_training_summary
+from refusals import complaint
 from shared_things import MadeOnce, toy_workspace, write_toy_workspace
 from web_case import violations
 
@@ -63,12 +64,6 @@ def workspace(made_once: MadeOnce, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def analyze(root: Path, *more: str) -> dict[str, Any]:
     assert main(["analyze", "gaussian-avatars", str(root), *more]) == 0
     return json.loads((root / "analysis/toy/analysis.json").read_text())
-
-
-def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(arguments) == 2
-    (line,) = [text for text in capsys.readouterr().err.splitlines() if text.strip()]
-    return line
 
 
 def test_every_part_end_to_end(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,8 +121,7 @@ def test_nothing_is_measured_twice(workspace: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(measuring, "measure_drawing", stop_at_second)
     asked = ("--parts", "speed", "growth", "--seconds", "0.01")
     assert main(["analyze", "gaussian-avatars", str(workspace), *asked]) == 130
-    record = json.loads((workspace / "analysis/toy/analysis.json").read_text())
-    assert list(record["parts"]) == ["growth"]
+    assert list(json.loads((workspace / "analysis/toy/analysis.json").read_text())["parts"]) == ["growth"]
     first = analyze(workspace, *asked)
     assert measured == [(16, 24), (24, 32), (16, 24), (24, 32)]
     assert analyze(workspace, *asked)["parts"] == first["parts"]
@@ -203,8 +197,7 @@ def test_the_jaw_opens_and_teeth_go() -> None:
     free = replace(model, joint_free=(False, True, True))
     face = replace(face, joints=torch.zeros(1, 2, 3))
     assert float(jaw_opening(open_jaw(face, free), free)[0]) == pytest.approx(0.3)
-    jawless = replace(model, joint_names=("head", "neck", "chin"))
-    assert open_jaw(face, jawless) is face
+    assert open_jaw(face, replace(model, joint_names=("head", "neck", "chin"))) is face
     less = without_teeth(model)
     assert len(less.faces) == len(model.faces) - int(model.region_mask("teeth").sum())
     assert not bool(less.region_mask("teeth").any())
@@ -286,13 +279,11 @@ def test_bad_input_is_told_in_one_line(workspace: Path, monkeypatch: pytest.Monk
     assert main(["analyze", "W", "--run", "toy", "--seconds", "0.01"]) == 0
     told = json.loads((workspace / "analysis/toy/analysis.json").read_text())["parts"]["teeth"]["notes"][1]
     assert "No frames were compared" in told
-    capsys.readouterr()
     assert "missing" in complaint(capsys, "analyze", "gaussian-avatars", "W", "--run", "toy", "--parts", "scale")
 
 
 def test_a_damaged_record_is_told_and_links_are_refused(workspace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     analyze(workspace, "--parts", "growth")
-    capsys.readouterr()
     record = workspace / "analysis/toy/analysis.json"
     for damage in (lambda content: content["parts"]["growth"].pop("findings"), lambda content: content.update(parts=3)):
         edit_json(record, damage)

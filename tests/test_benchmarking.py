@@ -73,15 +73,6 @@ def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.Monkey
     assert _native.rasterize_isa() == best
 
 
-@pytest.mark.parametrize(("line", "told"), [
-    ("scaling --plot chart.jpg", "charts are written as .svg"),
-    ("train-step --parts --method headgas", "--parts --method headgas"),
-    ("train-step --seconds=0", "--seconds 0: give a number above 0"),
-])  # fmt: skip
-def test_what_cannot_be_measured_is_told_at_once(line: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert told in complaint(capsys, "bench", *line.split())
-
-
 def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """All that a step does is in some row, each native operation in its own, and nothing stays watched."""
     reads: list[int] = []

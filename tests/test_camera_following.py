@@ -71,8 +71,7 @@ def course(landmarks: np.ndarray) -> Course:
     """Return a follower before which nobody is seen first, and then the clip. After each frame: its state and face."""
     one, states = follower(), []
     for seconds, found in [(-1.0, None), *((index / FPS, each) for index, each in enumerate(landmarks))]:
-        face = one(found, SIZE, SIZE, seconds)
-        states.append((one.state, face))
+        states.append((one.state, one(found, SIZE, SIZE, seconds)))
     return one, states
 
 
@@ -168,8 +167,7 @@ def test_an_open_mouth_while_it_learns_is_not_the_face_at_rest() -> None:
 def test_head_pose_can_be_left_out_and_limits_hold(landmarks: np.ndarray) -> None:
     inputs = len(MODEL.expression_names) + 3 * len(MODEL.free_joint_names)
     zeros, aside = np.zeros(inputs, np.float32), np.array([0, 0, 1], np.float32)
-    ellipse = np.zeros((2, 2), np.float32)
-    filmed = runtime.Filmed(zeros, zeros, ellipse)
+    filmed = runtime.Filmed(zeros, zeros, np.zeros((2, 2), np.float32))
     still = follower(head_pose=False)
     given = MODEL, MODEL.neutral(), filmed, aside
     kept, free = (Follower(*given, FollowOptions(unlimited=which)) for which in (False, True))

@@ -96,8 +96,7 @@ def test_pictures_mattes_plates_and_landmarks_are_straightened(tmp_path: Path) -
     assert abs(found_dots(given.plate[..., 2]) - DOTS).max() < 0.05
     assert abs(found_dots(given.mattes.matte(0, whole_picture(WIDTH, HEIGHT, WIDTH))) - DOTS).max() < 0.05
     assert abs(given.landmarks[0, : len(DOTS)] - DOTS).max() < 0.01
-    half = cv2.resize(picture, None, fx=0.5, fy=0.5)
-    large = cv2.resize(lens.straighten(half), (WIDTH, HEIGHT))
+    large = cv2.resize(lens.straighten(cv2.resize(picture, None, fx=0.5, fy=0.5)), (WIDTH, HEIGHT))
     assert abs(found_dots(lens.straighten(picture)) - found_dots(large)).max() < 0.2, "small pictures"
 
 
@@ -166,8 +165,7 @@ def test_colors_follow_the_formula(terms: int) -> None:
 def test_pictures_and_plates_are_corrected_and_mattes_are_not(tmp_path: Path) -> None:
     matrix = color_charts.correction(5)
     entry = {**SMALL, "color_correction": matrix.tolist()}
-    rig = write_rig(tmp_path / "rig.json", entry)
-    (camera,) = read_calibration(rig)
+    (camera,) = read_calibration(write_rig(tmp_path / "rig.json", entry))
     assert camera.colors is not None
     for name, seed in (("pictures/0.png", 1), ("plate.png", 2), ("mattes/0.png", 3)):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -341,8 +339,7 @@ def test_a_green_screen_leaves_no_rim(test_data: Path, tmp_path: Path, capsys):
     capture = capture_video(test_data / "cases/green_screen.mp4", tmp_path / "capture", CaptureSettings(max_frames=6))
     assert "the background is an even screen (red" in capsys.readouterr().err
     pictures, mattes = (np.asarray(part)[:, 0].astype(float) for part in (capture.images, capture.mattes))
-    green = pictures[..., 1] - pictures[..., [0, 2]].max(-1)
-    assert (green * mattes / 255).max() < 25
+    assert ((pictures[..., 1] - pictures[..., [0, 2]].max(-1)) * mattes / 255).max() < 25
     assert mattes[:, :, :30].max() == 0
     assert mattes[:, 285:].max() == 0, "shoulders that the network sees are screen"
     assert (mattes == 255).mean() > 0.1

@@ -181,8 +181,7 @@ def test_motion_blur_is_told_from_light_blur_in_every_direction(face, angle, noi
     usual = [noisy(face, noise, seed) for seed in range(7)]
     strengths = (0.015, 0.05, 0.1)
     streaked = [noisy(streak(face, share * WIDTH, np.deg2rad(angle)), noise, 9) for share in strengths]
-    measured = np.array([measure_face(picture, FACE) for picture in usual + streaked])
-    quality = relative_quality(measured)
+    quality = relative_quality(np.array([measure_face(picture, FACE) for picture in usual + streaked]))
     assert quality.blurred[:, 0].tolist() == [False] * 7 + [False, True, True]
     assert (np.diff(quality.sharpness[-4:, 0]) < 0).all(), "the stronger, the less sharp"
     np.testing.assert_allclose(np.median(quality.sharpness), 1, atol=0.1)

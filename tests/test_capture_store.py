@@ -134,16 +134,6 @@ def test_only_captures_are_replaced(stored, tmp_path):
     assert chapter.read_text() == "do not delete"
 
 
-def test_interrupted_writing_leaves_the_old_capture(stored, monkeypatch):
-    def full_disk(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("mien.capture.frame_files.encode_picture", full_disk)
-    refuses("No space left", write_capture, stored, random_capture(seed=1))
-    monkeypatch.undo()
-    assert_same_capture(random_capture(), read_capture(stored))
-
-
 def leave(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=1 << 40, used=0, free=free))
 

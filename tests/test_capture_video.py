@@ -101,8 +101,7 @@ def test_bad_videos_are_named_and_nothing_is_written_of_nothing_or_nowhere(tmp_p
 @pytest.mark.parametrize("transfer", [PQ, HLG])
 def test_hdr_comes_back_as_the_colors_it_was_made_of(tmp_path, transfer):
     path = tmp_path / "hdr.mkv"
-    light = light_of(COLORS)
-    signal = np.repeat(np.repeat(hdr_signal(light, transfer)[None], 8, axis=0), 8, axis=1)
+    signal = np.repeat(np.repeat(hdr_signal(light_of(COLORS), transfer)[None], 8, axis=0), 8, axis=1)
     write_planes(path, [to_planes(signal, BT2020, 10)], "yuv444p10le", (9, 9, transfer, 1))
     assert probe_video(path).hdr == {PQ: "PQ", HLG: "HLG"}[transfer]
     _, picture = next(read_video_frames(path))
@@ -121,8 +120,7 @@ def test_hdr_highlights_are_pressed_together_without_a_step(tmp_path):
     assert 230 <= gray[np.searchsorted(levels, 1.0), 1] <= 245  # diffuse white
     assert (gray[levels >= 1000 / 203, 1] == 255).all()
     np.testing.assert_allclose(roll_off(np.array([0.75, 1000 / 203, 50.0])), [0.75, 1, 1])
-    slope = np.diff(roll_off(np.array([0.75, 0.7501])))
-    np.testing.assert_allclose(slope, 1e-4, rtol=1e-3)
+    np.testing.assert_allclose(np.diff(roll_off(np.array([0.75, 0.7501]))), 1e-4, rtol=1e-3)
 
 
 def test_ten_bits_are_rounded_exactly(tmp_path):

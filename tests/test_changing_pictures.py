@@ -99,8 +99,7 @@ def test_what_is_drawn_beside_a_face_is_no_cut(name: str, level: int) -> None:
     ) if is_cut else level  # fmt: skip
     film = np.stack([shot] * 10 + [other] * 10 + [shot] * 10)
     film = np.clip(film + random.normal(0, 1, film.shape), 0, 255).astype(np.uint8)
-    faces = np.broadcast_to(FACE, (30, 1, 4))
-    assert find_cuts(film, faces) == ([10, 20] if is_cut else [])
+    assert find_cuts(film, np.broadcast_to(FACE, (30, 1, 4))) == ([10, 20] if is_cut else [])
 
 
 def test_a_person_who_leaves_another_is_no_cut() -> None:

@@ -54,8 +54,7 @@ def check_pose(
 
 @pytest.mark.unchecked
 def test_nerface(scene: Scene, tmp_path: Path) -> None:
-    folder = writers.write_nerface(tmp_path / "person_1", scene)
-    train, test = checks.read(folder, "nerface")
+    train, test = checks.read(writers.write_nerface(tmp_path / "person_1", scene), "nerface")
     assert isinstance(train, FilmedSequence)
     assert (train.capture.name, test.capture.name) == ("train", "test")
     assert train.foreign["expression"][:, 0].tolist() == [0, 1, 2, 3], "the order of time"

@@ -221,8 +221,7 @@ def test_pauses_and_dropped_and_odd_frames_do_not_change_the_rate(capsys: pytest
     assert "clip: a pause of 19.0 s without a frame, after 1.0 s" in capsys.readouterr().err
     pace_report("clip", np.concatenate([times[:40], 60 + times]))
     assert "3 pauses, the longest of 39.7 s without a frame, after 20.3 s" in capsys.readouterr().err
-    random = np.random.default_rng(0)
-    kept = np.flatnonzero(random.uniform(size=300) > 0.2)
+    kept = np.flatnonzero(np.random.default_rng(0).uniform(size=300) > 0.2)
     assert frame_rate((kept - kept[0]) / 25, 25.0) == 25
     assert frame_rate((kept - kept[0]) / 25, 19.9) == pytest.approx(25)
     assert frame_rate(np.cumsum([0, *[2, 3] * 20]) / 60, 60.0) == pytest.approx(24)  # a film

@@ -111,8 +111,7 @@ def test_the_first_of_chosen_timesteps_keeps_its_pictures() -> None:
 def test_a_guided_filter_is_locally_affine_and_the_matte_beside_the_head_whole_within_a_margin() -> None:
     """Values that are affine in the guide stay, with channels that vary together, as in real pictures."""
     random = np.random.default_rng(5)
-    gray = random.random((40, 40, 1))
-    guide = (0.7 * gray + 0.3 * random.random((40, 40, 3))).astype(np.float32)
+    guide = (0.7 * random.random((40, 40, 1)) + 0.3 * random.random((40, 40, 3))).astype(np.float32)
     guide = np.repeat(np.repeat(guide, 2, 0), 2, 1)  # The filter works on every second pixel.
     values = guide @ np.array([0.6, -0.4, 0.8], np.float32) + 0.1
     found = guided_filter(guide, values, 8, 1e-7)

@@ -1,12 +1,15 @@
 """A short demo, who can read its reports, every command without a network, the examples and the code of docs/api.md."""
 
+import ctypes
 import fcntl
 import json
+import os
 import re
 import runpy
 import socket
 import struct
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +17,6 @@ import pytest
 
 from batch_stub import PROGRAM
 from conftest import MadeOnce
-from demo_case import DEMO, FRAMES, VIDEO, leave_network, make_demo, skip_if_online
 from forked import ForkServer
 from fuzzing.kills import TRACK
 from mien import runtime, tracking
@@ -23,6 +25,7 @@ from mien.cli import COMMANDS, main
 from mien.face.loading import add_face_model
 from mien.media.video import probe_video
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
+from needs import NO_NAMESPACE
 from shared_things import write_toy_workspace
 from toy_scene import toy_face_model
 from viewer_alone import page_of
@@ -101,7 +104,7 @@ def offline(demo: Path) -> Path:
 
 def run_all(server: ForkServer, lines: dict[str, str], **given: object) -> None:
     words = [[command, *(word.format(**given) for word in line.split())] for command, line in lines.items()]
-    done = server.call("demo_case:run_offline", words)
+    done = server.call("test_end_to_end:run_offline", words)
     assert done.wait() == 0, done.stderr
     told = [line for line in done.stdout.splitlines() if line.startswith("CODE")]
     assert told == [f"CODE {name} 0" for name in lines], done.stderr
@@ -226,3 +229,65 @@ def test_api_page(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.chdir(folder)
     exec("\n".join(blocks), {"__name__": "__main__"})
     assert "Gaussians" in capsys.readouterr().out
+
+
+DEMO = ("--seconds", "0.8", "--steps", "60")
+FRAMES = 12
+"""Number of frames of the clip."""
+VIDEO = "synthetic-0-0.8s.mp4"
+ONLINE = "online"
+"""Name of the file that the demo's folder has if it was made with a network, since there can be no namespace."""
+_NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
+
+
+def write_demo(folder: str) -> None:
+    """Run `mien demo` in this process, which must be a fork."""
+    if not leave_network():
+        (Path(folder) / ONLINE).touch()
+    shorten()
+    assert main(["demo", "--out", folder, *DEMO]) == 0
+
+
+def shorten() -> None:
+    """Let this process draw small demos, and films of few pictures."""
+    from mien.evaluation import living
+    from mien.lab.synthetic import RECIPES
+
+    small = {"width": 192, "height": 192, "fps": FRAMES / 0.8, "supersample": 1, "texture_size": 256}
+    RECIPES["demo"] = replace(RECIPES["demo"], **small)
+    living.FPS = 2
+
+
+def run_offline(lines: list[list[str]]) -> None:
+    """Run commands one after the other without a network, and print the exit code of each."""
+    assert leave_network()
+    shorten()
+    for line in lines:
+        sys.argv = ["mien", *line]
+        print("CODE", line[0], main(line), flush=True)
+
+
+def leave_network() -> bool:
+    """Move this process into a network namespace that has not even a loopback; return whether that is possible."""
+    if sys.platform != "linux":
+        return False
+    user, group = os.getuid(), os.getgid()
+    if ctypes.CDLL(None).unshare(_NEW_USER | _NEW_NETWORK):
+        return False
+    Path("/proc/self/setgroups").write_text("deny")
+    Path("/proc/self/uid_map").write_text(f"0 {user} 1")
+    Path("/proc/self/gid_map").write_text(f"0 {group} 1")
+    assert [name for _, name in socket.if_nameindex()] == ["lo"]
+    with socket.socket() as no_socket:
+        assert no_socket.connect_ex(("127.0.0.1", 9)) == 101, "the loopback is down: the network is unreachable"
+    return True
+
+
+def skip_if_online(demo: Path) -> None:
+    if (demo / ONLINE).exists():
+        pytest.skip(NO_NAMESPACE)
+
+
+def make_demo(server: ForkServer, folder: Path) -> None:
+    process = server.call("test_end_to_end:write_demo", str(folder))
+    assert process.wait() == 0, process.stderr[-2000:]

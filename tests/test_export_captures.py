@@ -40,7 +40,7 @@ from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import write_scoring
 from mien.training import TrainSettings
 from mien.training.footage.sequence import Sequence
-from refusals import refuses
+from refusals import complaint, refuses
 from shared_things import write_toy_workspace
 
 pytestmark = pytest.mark.unchecked
@@ -106,8 +106,7 @@ def filmed(sequence: Sequence, scene: Scene, **settings: Any) -> Filmed:
 
 
 def export(folder: Path, name: str, content: Filmed) -> Path:
-    layout = known(find_layout(name))
-    write_layout(folder, content, layout)
+    write_layout(folder, content, known(find_layout(name)))
     return folder
 
 
@@ -307,8 +306,7 @@ def test_frames_that_mien_does_not_train_on_are_left_out(single: Sequence, scene
     gone = replace(single, capture=replace(single.capture, valid=valid[:, None]), tracking=tracking)
     folder = export(tmp_path / "out", "insta", filmed(gone, scene))
     (sequence,) = read(folder, "insta", scene.model)
-    kept = tuple(t for t in range(TIMESTEPS) if t != 3)
-    check_back(sequence, single, scene, kept, bends=False)
+    check_back(sequence, single, scene, tuple(t for t in range(TIMESTEPS) if t != 3), bends=False)
     assert sequence.own_split.timesteps == ((7, 9),), "numbers have no gaps"
     assert "Left out: 1 frame " in (folder / "README.txt").read_text()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["out"], "nothing else is left"
@@ -353,17 +351,11 @@ def test_the_command(single: Sequence, scene: Scene, tmp_path: Path, monkeypatch
     monkeypatch.setattr(training, "load_face_model", lambda _: scene.model)
 
     def refused(message: str, *options: str) -> None:
-        capsys.readouterr()
-        assert main(["export-dataset", str(workspace), "--out", str(out), *options]) == 2
-        (line,) = capsys.readouterr().err.strip().splitlines()
-        assert message in line
+        assert message in complaint(capsys, "export-dataset", workspace, "--out", out, *options)
 
     refused("--benchmark is an option of --format nersemble-benchmark", "--format", "insta", "--benchmark", "393")
-    refused(
-        "choose insta, imavatar, nerface, nerf-blendshape, avatar-mav, nersemble or nersemble-benchmark",
-        "--format",
-        "inst",
-    )
+    layouts = "insta, imavatar, nerface, nerf-blendshape, avatar-mav, nersemble or nersemble-benchmark"
+    refused(f"choose {layouts}", "--format", "inst")
     refused("there is no run yet", "--format", "insta", "--run", "me")
     refused("no sequence 'other'", "--format", "insta", "--sequence", "other")
     refused("--split dataset: the sequence clip has no split", "--format", "insta", "--split", "dataset")

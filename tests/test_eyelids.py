@@ -320,8 +320,7 @@ def test_what_few_pictures_show_is_no_hand(drawn, stride, odd, turn):
     face = replace(truth.face, head_rotation=rotation)
     tracking = replace(truth, valid=truth.valid[rare], face=face[rare])
     pictures = {name: getattr(shown, name)[rare] for name in ("timestamps", "images", "mattes", "landmarks", "valid")}
-    few = replace(shown, fps=shown.fps / stride, **pictures)
-    assert not covered_parts(few, tracking, model).any()
+    assert not covered_parts(replace(shown, fps=shown.fps / stride, **pictures), tracking, model).any()
 
 
 @pytest.mark.unchecked

@@ -248,8 +248,7 @@ def test_pages_agree_with_python(built: Path, tmp_path: Path, portable: runtime.
 
 
 def test_a_preset_beyond_what_was_filmed_is_told(model: FaceModel, capsys: pytest.CaptureFixture[str]) -> None:
-    inputs = len(model.expression_names) + 3 * len(model.free_joint_names)
-    zero = np.zeros(inputs, np.float32)
+    zero = np.zeros(len(model.expression_names) + 3 * len(model.free_joint_names), np.float32)
     highest = zero.copy()
     highest[model.expression_names.index("mouthSmileLeft")] = 1
     filmed = runtime.Filmed(zero, highest, np.zeros((2, 2), np.float32))

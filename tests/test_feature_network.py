@@ -170,8 +170,7 @@ def test_gradients_of_neutral_features_share_memory_until_a_second_backward_pass
     for number in range(2):
         outputs = feature_network(bases, inputs.detach(), None, neutral, own, Layers(*layers), gradient)
         torch.autograd.backward(outputs, gradients_of(SIZES[0]))
-        shared = known(neutral.grad)
-        assert (shared.data_ptr() == gradient.terms[0].rows.data_ptr()) is (number == 0)
+        assert (known(neutral.grad).data_ptr() == gradient.terms[0].rows.data_ptr()) is (number == 0)
     first, second = (term.rows for term in gradient.take())
     assert first.equal(second)
     assert float(first.abs().sum()) > 0

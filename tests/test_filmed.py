@@ -67,8 +67,7 @@ def _avatar(face: FaceParams, method: str = DEFAULT_METHOD) -> Avatar:
 
 def _written(path: Path, avatar: Avatar, **changes: object) -> runtime.PortableAvatar:
     """Write an avatar as a .mien file, and read it."""
-    portable = replace(make_portable(avatar, toy_camera(32), "toy"), **changes)
-    runtime.write_portable(path, portable)
+    runtime.write_portable(path, replace(make_portable(avatar, toy_camera(32), "toy"), **changes))
     return runtime.read_portable(path)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mien.capture.cameras.calibration import CalibratedCamera, match_sources, read_calibration
-from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.datasets.live_link_face_take import LIVE_LINK_FACE
 from mien.disk.reading import listed
@@ -22,7 +21,7 @@ from mien.evaluation.image_folders import open_pictures
 from mien.media.source import list_images
 from mien.pipeline import drive as driving
 from recordings import live_link_face, row, write_csv, write_json
-from refusals import refuses
+from refusals import complaint, refuses
 from toy_scene import toy_camera
 
 
@@ -179,8 +178,7 @@ def test_what_systems_leave_is_skipped(tmp_path, names: tuple[str, ...], read: C
 def test_a_workspace_is_no_folder_of_videos(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     """Its films show the avatar, from which no other one is made."""
     given(tmp_path / "ann", "me.mp4", "runs/headgas/film.mp4")
-    assert main([command, str(tmp_path / "ann"), "--out", str(tmp_path / "out")]) == 2
-    (told,) = capsys.readouterr().err.splitlines()
+    told = complaint(capsys, command, tmp_path / "ann", "--out", tmp_path / "out")
     assert "is a workspace" in told
     assert f"mien train {tmp_path / 'ann'}" in told
     assert "me.mp4" not in told
@@ -204,8 +202,7 @@ def test_pictures_drive_an_avatar(tmp_path: Path, monkeypatch, names: tuple[str,
     monkeypatch.setattr(driving, "run_tracking_stage", lambda *_, **__: {"clip": None})
     monkeypatch.setattr(driving, "cache_folder", lambda: tmp_path / "cache")
     folder = given(tmp_path / "people", *names)
-    film = folder if whole else folder / names[0]
-    workspace, found = driving.tracked_film(film, "anny")
+    workspace, found = driving.tracked_film(folder if whole else folder / names[0], "anny")
     assert isinstance(workspace, Workspace)
     assert (found, len(captured)) == (["clip"], (count if whole else 3))
     assert captured[0].read_bytes() == (folder / names[0]).read_bytes()

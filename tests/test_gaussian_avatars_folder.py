@@ -30,8 +30,7 @@ EQUAL = 1e-4
 
 def new_avatar(face_model: FaceModel, face: FaceParams, **config: object) -> Avatar:
     """Return an avatar of GaussianAvatars with several Gaussians on some triangles, whose values are all random."""
-    method = METHODS["gaussian_avatars"]
-    avatar = method.avatar(plain_gaussian_avatars(**config), face_model, face)
+    avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(**config), face_model, face)
     avatar.store.append(torch.arange(0, len(face_model.faces), 3))
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():

@@ -78,7 +78,7 @@ def test_sequences_and_their_split(subject: Path, tmp_path: Path, capsys: pytest
     assert settings.held_out_sequences == (CLIPS[1],)
     assert {frame.sequence for frame in training_frames(read, settings)} == {0}
     assert "decides what is held out" in complaint(capsys, "train", out, "--split", "dataset", "--hold-out", CLIPS[0])
-    assert "is there already" in complaint(capsys, *again)
+    assert "is there already" in complaint(capsys, *again, alone=False)
     assert main([*again, "--resume"]) == 0
     assert "all sequences are there already" in capsys.readouterr().err
 
@@ -101,14 +101,14 @@ def test_pictures_are_tracked_again_if_asked(subject: Path, tmp_path: Path, monk
 @pytest.mark.usefixtures("added")
 def test_mistakes_leave_nothing(scene: Scene, subject: Path, tmp_path: Path, capsys) -> None:
     out = ["--out", str(tmp_path / "out")]
-    assert "needs FLAME 2020" in complaint(capsys, "import", str(subject), *out)
+    assert "needs FLAME 2020" in complaint(capsys, "import", str(subject), *out, alone=False)
     assert "give only one" in complaint(capsys, "import", str(subject), *out, "--retrack", "--face-model", "flame")
     assert "holds 1 people (subject1); import each" in complaint(capsys, "import", str(subject.parent), *out)
     other = write_insta(tmp_path / "other", scene)
     frame = other / "checkpoint/00001.frame"
     frame.unlink()
     frame.symlink_to("/etc/hostname")
-    assert "leads out of the dataset" in complaint(capsys, "import", str(other), *out, "--face-model", "flame")
+    assert "leads out of the dataset" in complaint(capsys, "import", other, *out, "--face-model", "flame", alone=False)
     wrong = ["import", str(other), *out, "--dataset", "vhap"]
     assert f"{other}: looks like insta, and cannot be read as vhap; leave --dataset out (" in complaint(capsys, *wrong)
     assert not list((tmp_path / "out").glob("sequences/*"))

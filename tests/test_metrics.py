@@ -43,8 +43,7 @@ def test_ssim_equals_a_direct_evaluation_of_its_definition() -> None:
     target = torch.rand(24, 31, 3, generator=generator)
     image = (target + 0.1 * torch.randn(24, 31, 3, generator=generator)).clamp(0, 1)
     assert ssim(image, image) == pytest.approx(1, abs=1e-6)
-    offsets = np.arange(11) - 5
-    window = np.exp(-(offsets**2) / (2 * 1.5**2))
+    window = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
     window = np.outer(window, window) / window.sum() ** 2
     got = ssim_map(image, target)
     padded = [np.pad(t.double().numpy(), ((5, 5), (5, 5), (0, 0))) for t in (image, target)]

@@ -21,7 +21,7 @@ from mien.training import PRESETS, TrainSettings
 from mien.training.footage.frames import training_frames
 from mien.training.settings import doubly_held_out
 from mien.training.settings.splits import SEQUENCES, SPLITS, Recorded, Recordings, driving_sequences, fill_in
-from refusals import refuses
+from refusals import complaint, refuses
 from toy_scene import toy_face_model, toy_sequence, toy_tracking
 
 FOLDERS = (
@@ -187,10 +187,7 @@ def test_train_refuses_what_does_not_fit(first: Path, tmp_path: Path, asked: lis
         ((*create, *named.split()), "needs ten sequences"),
         ((*create, "--split", "nersemble-benchmark"), "needs several sequences"),
     ):
-        capsys.readouterr()
-        assert main(line) == 2
-        (told,) = filter(str.strip, capsys.readouterr().err.splitlines())
-        assert words in told
+        assert words in complaint(capsys, *line)
     assert not asked
 
 

@@ -18,7 +18,6 @@ from av.stream import Disposition
 from capture_helpers import encode, write_gradient_video
 from mien.capture.person.crop import whole_picture
 from mien.capture.person.given import GivenMattes
-from mien.cli import main
 from mien.errors import UserError
 from mien.evaluation.image_folders import read_picture
 from mien.media.decoding import MAX_PICTURE_PIXELS, announced_size, decode_picture
@@ -28,7 +27,7 @@ from mien.media.source import FrameSelection, open_source, read_image
 from mien.media.video import count_frames, probe_video, read_video_frames, write_video
 from mien.media.video_file import MAX_FRAME_PIXELS
 from mien.media.writing import write_pictures
-from refusals import refuses
+from refusals import complaint, refuses
 
 pytestmark = pytest.mark.unchecked
 NAMES = (
@@ -78,8 +77,7 @@ def test_folders_of_pictures_with_odd_names_and_sizes(tmp_path: Path) -> None:
 def test_a_codec_that_nobody_knows_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = grey(tmp_path / "a.mp4")
     path.write_bytes(path.read_bytes().replace(b"avc1", b"qq\x1b1"))
-    assert main(["capture", str(path), "--out", str(tmp_path / "out")]) == 2
-    (told,) = capsys.readouterr().err.strip().splitlines()
+    told = complaint(capsys, "capture", path, "--out", tmp_path / "out")
     assert "FFmpeg does not know its codec" in told
     assert "\x1b" not in told
 

@@ -153,8 +153,7 @@ def test_every_camera_of_a_timestep_counts_in_every_step(case):
 
 
 def test_every_step_of_pass_and_epochs_has_all_cameras(case, monkeypatch):
-    settings = replace(PAPER, paper=replace(QUICK, first_steps=2, steps=1))
-    descent, counts = _descent(case, settings), []
+    descent, counts = _descent(case, replace(PAPER, paper=replace(QUICK, first_steps=2, steps=1))), []
     frame_cost = Descent.frame_cost
 
     def counted(self: Descent, targets: list, *more: Any) -> torch.Tensor:

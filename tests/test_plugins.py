@@ -211,8 +211,7 @@ def test_a_package_that_is_wrong_is_named(
     install(tmp_path, "mien_none9", code, f"[mien.{group}]\nnone9 = mien_none9:IT\n")
     (tmp_path / "F").mkdir()
     (tmp_path / "F/point_cloud.ply").touch()
-    words = line.format(run=workspace, here=tmp_path).split()
-    done = mien(fork_server, tmp_path, *words)
+    done = mien(fork_server, tmp_path, *line.format(run=workspace, here=tmp_path).split())
     assert done.returncode == 2
     assert told in done.stderr
 

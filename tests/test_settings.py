@@ -16,8 +16,9 @@ from mien.avatar.settings import FaceTuning, GradientSettings, MethodConfig, Rat
 from mien.cli import main
 from mien.pipeline import train as training
 from mien.training import PRESETS, TrainSettings
+from refusals import complaint
 from shared_things import toy_workspace
-from test_training_resume import RESULTS
+from test_training_batch import RESULTS
 from toy_scene import toy_face_model
 
 RUN, STANDARD = TrainSettings(), GaussianAvatarsConfig()
@@ -60,13 +61,6 @@ def with_file(workspace: Path, content: str) -> list[str]:
     return ["train", str(workspace), "--config", str(path)]
 
 
-def complaint(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
-    """Run a command that must fail by the user's mistake, and return its one line."""
-    assert main(words) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
-    return line
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_without_options_a_run_has_the_defaults(method: str, choices: Any) -> None:
     config = METHODS[method].config()
@@ -85,9 +79,9 @@ def test_a_preset_that_the_method_does_not_have_is_refused(workspace, capsys, mo
     monkeypatch.delitem(mono_gaussian_avatar_presets, "paper")
     words = f"--preset paper: {name} has no such preset; it has draft and standard"
     for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(workspace / "new")]):
-        assert words in complaint(capsys, [*command, "--method", name, "--preset", "paper"])
+        assert words in complaint(capsys, *command, "--method", name, "--preset", "paper")
     line = with_file(workspace, json.dumps({"method": {"kind": name}}))
-    assert words in complaint(capsys, [*line, "--preset", "paper"])
+    assert words in complaint(capsys, *line, "--preset", "paper")
 
 
 def test_options_reach_every_depth_and_win_over_the_file_and_the_file_over_the_preset(choices: Any) -> None:
@@ -151,7 +145,7 @@ def test_face_tuning_is_turned_off_and_on(choices: Any) -> None:
 def test_options_that_make_no_sense_are_refused_before_any_work(line: str, words: str, workspace, capsys) -> None:
     new = workspace / "new"
     for command in (["train", str(workspace)], ["create", str(workspace), "--out", str(new)]):
-        assert words in complaint(capsys, [*command, *line.split()])
+        assert words in complaint(capsys, *command, *line.split())
     assert not (workspace / "runs").exists()
     assert not new.exists()
 
@@ -181,7 +175,7 @@ def test_options_that_make_no_sense_are_refused_before_any_work(line: str, words
     ],
 )  # fmt: skip
 def test_files_that_make_no_sense_are_refused_before_any_work(content: str, words: str, workspace, capsys) -> None:
-    line = complaint(capsys, with_file(workspace, content))
+    line = complaint(capsys, *with_file(workspace, content))
     assert words in line
     assert len(line) < 1000
     assert not (workspace / "runs").exists()
@@ -194,9 +188,9 @@ def test_paths_that_are_no_file_and_files_of_another_method_are_refused(workspac
         (workspace / "gone.json", "gone.json: no such file"), (runs, "is a folder; give a json file, such as DIR/"),
         ("/dev/null", "is not an ordinary file"), ("", "--config= is empty"),
     ):  # fmt: skip
-        assert words in complaint(capsys, ["train", str(workspace), f"--config={path}"])
+        assert words in complaint(capsys, "train", str(workspace), f"--config={path}")
     words = [*with_file(workspace, '{"method": {"kind": "headgas"}}'), "--method", "gaussian_avatars"]
-    assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, words)
+    assert "has settings of headgas, but --method asks for gaussian_avatars" in complaint(capsys, *words)
 
 
 def test_a_run_is_repeated_from_its_config_to_the_same_bytes(made_once, tmp_path, monkeypatch, capsys) -> None:
@@ -216,4 +210,4 @@ def test_a_run_is_repeated_from_its_config_to_the_same_bytes(made_once, tmp_path
     assert main([*words, str(again / "config.json"), "--run", "shorter"]) == 0
     assert json.loads((tmp_path / "runs/shorter/training.json").read_text())["steps"] == 4
     capsys.readouterr()
-    assert "damaged or edited" in complaint(capsys, ["evaluate", str(tmp_path), "--run", "again"])
+    assert "damaged or edited" in complaint(capsys, "evaluate", str(tmp_path), "--run", "again")

@@ -104,8 +104,7 @@ def test_a_head_in_other_colors_than_the_mesh_costs_and_so_do_transparent_sides(
     other = _opaque_avatar(anny, 0.9)
     held = replace(face, head_translation=face.head_translation.clone().requires_grad_())
     _loss(views, other, held, 0).backward()
-    gradient = known(other.store["sh_constant"].grad)
-    assert float(gradient.abs().sum()) > 0
+    assert float(known(other.store["sh_constant"].grad).abs().sum()) > 0
     assert held.head_translation.grad is None, "gradients do not reach the face"
     costs = {step: float(_loss(views, avatar, face, step).detach()) for step in (0, 4)}
     for step, most in ((0, 0.7), (4, 0.3)):  # From aside, the neck below the cut costs too.
@@ -126,8 +125,7 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
     assert float(turned) == 0
     # The random numbers raise coefficients until activations have the length that they approach.
     assert 0 < float(raised) <= 8 * 3 * 1.1**2
-    surface = known(avatar.extras.surface)
-    hair = ~views.compared[surface.triangles()]
+    hair = ~views.compared[known(avatar.extras.surface).triangles()]
     assert 0.1 < float(hair.float().mean()) < 0.9
     kept = torch.where(hair[:, None, None], 0.0, avatar.store["offset_basis"])
     avatar.store.assign("offset_basis", kept)

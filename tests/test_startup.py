@@ -179,7 +179,7 @@ WORKING = {
 LACKING = {
     "export {file} --out {out}/me.ply": ("torch", "create"), "render {file} --out {out}/me.mp4": ("av", "video"),
     "capture {file} --out {out}/me": ("av", "create"), "view {file}": ("viser", "viewer"),
-    "demo --out {out}/demo": ("filelock", "create"),
+    "demo --out {out}/demo": ("filelock", "create"), "export {file} --out {out}/me.usda": ("usd-core", "usd"),
 }  # fmt: skip
 
 

@@ -104,8 +104,7 @@ def picture(avatar: TexturedMesh) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize(("surfels", "least"), [(1, 0.95), (400, 0.99)])
 def test_surfels_cover_the_mesh(surfels: int, least: float) -> None:
     """Nothing shows through, also after vertices have moved far, but a little beside very uneven surfels."""
-    config = replace(PLAIN, surfels=surfels, smoothing=0)
-    avatar = new_avatar(config, plane_model())
+    avatar = new_avatar(replace(PLAIN, surfels=surfels, smoothing=0), plane_model())
     alpha, inside = picture(avatar)
     assert inside.float().mean() > 0.1
     assert alpha[inside].min() > least

@@ -36,8 +36,7 @@ def test_recovers_the_truth(tracked):
     case, tracking = tracked
     face = tracking.face.to(case.pixels)
     turn = matrix_from_axis_angle(face.head_rotation) @ matrix_from_axis_angle(case.face.head_rotation).mT
-    angle = ((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos().rad2deg()
-    assert angle.median() < 0.3
+    assert ((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos().rad2deg().median() < 0.3
     # These are landmarks of the mesh itself, without noise and without any static offset.
     pixels = case.camera.project(case.model.landmark_positions(case.model(face), "mediapipe"))[0]
     assert (pixels - case.pixels).norm(dim=-1).median() < 0.3

@@ -33,6 +33,7 @@ from mien.tracking.report.preview import Preview
 from mien.tracking.settings import PaperSettings, PhotometricSettings, TrackingSettings
 from mien.tracking.tracking import Tracking
 from photometric_case import FOCAL, PhotometricCase, assert_alike, make_photometric_case, make_textured_model
+from refusals import complaint
 from test_photometric_tracking import turn_error, wobble
 
 LANDMARKS = TrackingSettings(schedule="landmarks")
@@ -215,15 +216,13 @@ def test_the_command_tracks_apart(case, shaping, apart, workspace, capsys):
 
 def test_wrong_names_are_refused(workspace, tmp_path, capsys):
     (tmp_path / "a.mp4").touch()
-    for command, complaint in (
+    for command, words in (
         (["track", str(workspace), "--hold-out", "nobody", *QUICKLY], "nobody"),
         (["track", str(workspace), "--hold-out", "apart", "shaping", *QUICKLY], "apart shaping: leaves no sequence"),
         (["create", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "new"), "--track-apart"],
          "--track-apart: needs the sequences to track apart; add --hold-out NAME"),
     ):  # fmt: skip
-        assert main(command) == 2
-        assert complaint in (error := capsys.readouterr().err.strip())
-        assert "\n" not in error
+        assert words in complaint(capsys, *command)
     assert not list(workspace.glob("sequences/*/tracking"))
 
 

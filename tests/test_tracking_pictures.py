@@ -146,8 +146,7 @@ def test_the_page_says_aloud_what_decided(case, truth, tmp_path, schedule, appea
         truth, settings={"schedule": schedule}, appearance=truth.appearance if appearance else None,
         pixel_residuals=residuals if appearance else None,
     )  # fmt: skip
-    told = write_residual_report(tmp_path, case.capture, shown, case.model)
-    assert said in told
+    assert said in write_residual_report(tmp_path, case.capture, shown, case.model)
     page = (tmp_path / "report.html").read_text()
     assert said in page
     panels = 4 if appearance else 2

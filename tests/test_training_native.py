@@ -1,5 +1,5 @@
 """The native parts of posing and of training steps agree with their plain PyTorch twins, on every instruction set.
-A table has them all. tests/test_feature_network.py, tests/test_point_network.py and others hold what is special."""
+A table has them all. tests/test_feature_network.py, tests/test_point_avatar.py and others hold what is special."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import test_feature_network as features
-import test_point_network as points
+import test_point_avatar as points
 from instruction_sets import by_threads
 from mien import _native
 from mien.adam import FactoredMoments, FactoredTerm

@@ -67,8 +67,7 @@ def test_every_command_that_writes_tells_who_is_at_it(other: Holder, studio: Stu
     with other.holding(*{place for place, _ in commands}):
         before = tree_bytes(studio.root)
         for place, words in commands:
-            assert main(words.split()) == 2, words
-            (line,) = capsys.readouterr().err.splitlines()  # and no progress bar before it
+            line = complaint(capsys, *words.split())  # and no progress bar before it
             told = f"mien: {place}: is being written by another command (process {other.pid} on "
             assert line.startswith(told), words
             assert ("--run NAME" in line) == words.startswith(("train", "create", "import"))
@@ -103,18 +102,17 @@ def test_a_run_that_is_being_trained_cannot_be_rendered_yet(other: Holder, studi
     shutil.copy(studio.root / "runs" / "alone" / "config.json", run)
     render = ["render", str(studio.root), "--run", "begun", "--out", str(tmp_path / "a.png")]
     with other.holding(run):
-        assert main(render) == 2
-        line = capsys.readouterr().err
+        line = complaint(capsys, *render)
         assert f"process {other.pid} on" in line
-        assert line.endswith("; try again when it is done\n")
+        assert line.endswith("; try again when it is done")
     assert "its training was not finished; run the same `mien train`" in complaint(capsys, *render)
     shutil.rmtree(run)
     # A workspace whose first capture is at work.
     clip = tmp_path / "w" / "sequences" / "clip"
     (clip / ".capture.partial").mkdir(parents=True)
     with other.holding(clip):
-        assert main(["track", str(tmp_path / "w")]) == 2
-    assert f"clip: is being written by another command (process {other.pid} on" in capsys.readouterr().err
+        told = complaint(capsys, "track", tmp_path / "w")
+    assert f"clip: is being written by another command (process {other.pid} on" in told
 
 
 def assert_same_run(studio: Studio, name: str) -> None:

@@ -71,8 +71,7 @@ def test_faults_are_found_in_their_region_and_true_pictures_are_perfect(pictures
 
 
 def test_references_of_talk_have_no_strong_expressions() -> None:
-    reference = REFERENCES["unfilmed-2"]
-    talk, everything, faces = reference.scenes()
+    talk, everything, faces = REFERENCES["unfilmed-2"].scenes()
     names = talk.model.expression_names
     strongest = dict(zip(names, talk.face.expression.amax(0).tolist(), strict=True))
     assert all(value == 0 for name, value in strongest.items() if name.startswith("brow"))

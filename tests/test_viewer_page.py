@@ -133,8 +133,7 @@ def test_two_clients_see_their_own_views_and_one_may_vanish(serving: Serving, se
                 second.transport.abort()  # the cable is pulled
             session.rest()
             await near.look(session, 96, 64)
-            again = await near.picture(64)
-            assert np.abs(again.astype(int) - shown).mean() < 2
+            assert np.abs((await near.picture(64)).astype(int) - shown).mean() < 2
             await near.look(session, 0, 0)  # a window that is hidden
             await near.look(session, 96, 64, float("nan"))
             await near.look(session, 48, 32)

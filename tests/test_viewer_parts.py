@@ -75,8 +75,7 @@ def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -
     here = {"Host": "me.example:80"}
     first = known(door.answer(f"/?token={door.token}", here))
     assert (first.status_code, first.headers["Location"]) == (303, "index.html")
-    cookie = first.headers["Set-Cookie"]
-    given, *attributes = cookie.split("; ")
+    given, *attributes = first.headers["Set-Cookie"].split("; ")
     assert {"HttpOnly", "SameSite=Strict"} <= set(attributes)
     assert door.answer("/", {**here, "Cookie": f"a=b; {given}"}) is None
     assert door.answer("/", {**here, "cookie": given, "origin": "http://me.example:80"}) is None

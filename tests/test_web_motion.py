@@ -38,8 +38,7 @@ def read_by_node(built: Path, folder: Path, recording: Path) -> dict[str, Any]:
 
 def driven_by_python(recording: Path) -> tuple[float, FaceParams]:
     portable, model = drawn_head(10), load_face_model("anny")
-    read = read_live_link_face if recording.suffix == ".csv" else read_blendshape_json
-    motion = read(recording)
+    motion = (read_live_link_face if recording.suffix == ".csv" else read_blendshape_json)(recording)
     face, rest = face_of_motion(motion, model)
     names = ("expression", "joints", "head_rotation", "head_translation")
     near = (torch.from_numpy(getattr(portable.neutral, name))[None] for name in names)
@@ -243,8 +242,7 @@ def test_lips_shut_at_p_b_and_m_and_the_jaw_opens_with_the_vowels(voice: Path, s
     opened = np.array([mouth["jawOpen"] for mouth in found])
     late = round(0.03 * FPS)
     at = (np.arange(len(found) - late) / FPS * RATE).astype(int)
-    truth = np.concatenate([np.zeros(RATE), jaw])[at]
-    assert np.corrcoef(opened[late:], truth)[0, 1] >= 0.8
+    assert np.corrcoef(opened[late:], np.concatenate([np.zeros(RATE), jaw])[at])[0, 1] >= 0.8
     edges = np.flatnonzero(np.diff(shut.astype(int), prepend=0, append=0)) / RATE * FPS + FPS
     closures = [slice(int(begin), int(end) + 3) for begin, end in edges.reshape(-1, 2)]
     assert np.mean([opened[one].min() < 0.06 for one in closures]) >= 0.8

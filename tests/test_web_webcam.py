@@ -210,8 +210,7 @@ def test_the_class_drives_the_element(tmp_path: Path, built: Path, pictures: lis
     for source, name in ((built, "element.js"), (built, "webcam.js"), (WEB / "examples", "webcam.html")):
         shutil.copy(source / name, tmp_path)
     (tmp_path / "tasks-vision").symlink_to(tasks_vision())
-    given = json.dumps(pictures[:2])
-    steps, flags = [script(CLASS.replace("GIVEN", given))], [FAKE, ALLOWED]
+    steps, flags = [script(CLASS.replace("GIVEN", json.dumps(pictures[:2])))], [FAKE, ALLOWED]
     with served(tmp_path) as address:
         without = browse(f"{address}/webcam.html", steps, WINDOW, flags=flags, opening=CAMERA)
         (tmp_path / "face_landmarker.task").symlink_to(test_data / "mediapipe" / "face_landmarker.task")

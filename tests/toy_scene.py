@@ -135,8 +135,7 @@ def surface_of(avatar: Avatar) -> BoundSurface:
 def _facing(vertices: Tensor, faces: Tensor) -> Tensor:
     """Return 1 for triangles whose outside the camera sees, and 0 for others."""
     v0, v1, v2 = vertices[faces].unbind(1)
-    normal = torch.linalg.cross(v1 - v0, v2 - v0)
-    return ((normal * (v0 + v1 + v2)).sum(-1) < 0).float()
+    return ((torch.linalg.cross(v1 - v0, v2 - v0) * (v0 + v1 + v2)).sum(-1) < 0).float()
 
 
 def sphere(rings: int, around: int, kept: int = -1, margin: float = 0.15) -> tuple[Tensor, Tensor]:

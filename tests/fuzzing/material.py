@@ -15,6 +15,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
 import train_toy
@@ -30,7 +31,9 @@ from mien.batch.plan import Batch, State
 from mien.commands.batch_table import read_table
 from mien.disk.config import encode
 from mien.disk.files import write_json, write_tensors
+from mien.driving.motion import ARKIT_NAMES
 from mien.evaluation import evaluate
+from mien.evaluation.image_folders import write_crops
 from mien.evaluation.protocols import EvaluationSettings, PartialScores
 from mien.face.cache import cache_folder
 from mien.face.listing import ADDED_RECIPE
@@ -59,7 +62,6 @@ from plain_settings import plain_config
 from recordings import LAYOUTS
 from shared_things import write_toy_workspace
 from toy_scene import sphere, toy_camera, toy_face_model, toy_sequence
-from what_users_give import write_what_users_give
 
 RUN, SEQUENCE, ANALYSIS, PIECES = "W/runs/toy", "W/sequences/clip", "W/analysis/toy", "pieces"
 GROWTH = replace(
@@ -213,7 +215,7 @@ def _write_splats(folder: Path, avatar: Avatar) -> None:
     written(folder / "colors.ply", {"red": "uint8"}, "\r", 1)
     plain = (folder / "colors.ply").read_bytes()
     (folder / "packed.ply").write_bytes(plain.replace(b"end_header", b"property uint packed_position\rend_header", 1))
-    spz(folder / "old.spz", 2, [(128, 127, 128), (255, 128, 127), (0, 127, 128)], 1)
+    spz(folder / "old.spz", [(128, 127, 128), (255, 128, 127), (0, 127, 128)], 1)
     with torch.no_grad():
         write_spz(folder / "new.spz", in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
 
@@ -348,3 +350,29 @@ def copy_of(material: Path, parts: tuple[str, ...], root: Path) -> None:
     root.mkdir(parents=True)
     for part in parts:
         (shutil.copytree if (material / part).is_dir() else shutil.copy2)(material / part, root / part)
+
+
+def write_what_users_give(folder: Path, picture: np.ndarray) -> None:
+    """Write one file of each kind, for three pictures of 32x32 pixels."""
+    points = np.random.default_rng(0).uniform(0, 32, (3, 478, 2)).astype(np.float32)
+    points[1] = np.nan
+    folder.mkdir()
+    safetensors.numpy.save_file({"landmarks": points}, folder / "points.safetensors")
+    rows = [",".join(f"{value:.3f}" for value in row) for row in points.reshape(3, -1)]
+    (folder / "points.csv").write_text("\n".join(rows) + "\n")
+    (folder / "mattes").mkdir()
+    for index in range(3):
+        assert cv2.imwrite(str(folder / f"mattes/{index}.png"), picture[..., 0])
+    write_crops(folder / "crops.json", {f"{index}.png": (4, 4, 20, 20) for index in range(3)})
+    camera = {"K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "width": 32, "height": 32}
+    cameras = {"format": "mien.cameras", "version": 1, "cameras": [camera, camera]}
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    columns = ["Timecode", "BlendshapeCount", *(name[0].upper() + name[1:] for name in ARKIT_NAMES), "HeadYaw"]
+    takes = [[f"0:00:0{frame}:00.0", "61", *["0.25"] * 53] for frame in range(4)]
+    (folder / "take.csv").write_text("\n".join(",".join(cells) for cells in (columns, *takes)) + "\n")
+    plain = [{"timestamp_ms": 40 * frame, "blendshapes": {"jawOpen": 0.5}} for frame in range(3)]
+    (folder / "take.json").write_text(json.dumps(plain))
+    categories = [{"categoryName": "jawOpen", "score": 0.5}]
+    matrix = {"rows": 4, "columns": 4, "data": np.eye(4).flatten().tolist()}
+    result = {"faceBlendshapes": [{"categories": categories}], "facialTransformationMatrixes": [matrix]}
+    (folder / "landmarker_take.json").write_text(json.dumps(result))

@@ -219,8 +219,7 @@ def fragments(c: Call) -> Arguments:
     """Return a drawn mesh, its image points and its faces."""
     vertices, faces, K, viewmat, _, out = rasterize_mesh(c)
     c.native.rasterize_mesh(vertices, faces, K, viewmat, False, out)
-    points = (vertices @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
-    return [out, np.ascontiguousarray(points, F32), faces]
+    return [out, np.ascontiguousarray((vertices @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T, F32), faces]
 
 
 def drawn(c: Call) -> tuple[Any, Any]:

@@ -97,8 +97,7 @@ def _portable_digest(content: Any, arrays: dict[str, np.ndarray]) -> str:
 
 def edit_json(path: Path, **values: Any) -> None:
     """Change entries of a json file, and correct its checksum."""
-    content = json.loads(path.read_text())
-    path.write_text(json.dumps(with_checksum({**content, **values})))
+    path.write_text(json.dumps(with_checksum({**json.loads(path.read_text()), **values})))
 
 
 def repair_around(file: Path) -> None:

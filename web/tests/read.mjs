@@ -1,4 +1,4 @@
-// Reads an avatar as a page does, for tests/test_hostile_pages.py:
+// Reads an avatar as a page does, for tests/test_web.py:
 //   node read.mjs MIEN.JS AVATAR   prints json: the error's message, if there is one, and the most memory in bytes
 import { existsSync, readFileSync, statSync } from "node:fs";
 import { pathToFileURL } from "node:url";

@@ -166,11 +166,9 @@ _ASIDE_PREFIX = ".making-"
 def stamp_cache(layout: FrameLayout, capture_hash: str) -> None:
     """Record that the cache is complete and matches the PNGs."""
     write_json(
-        layout.folder / CACHE / "stamp.json",
-        _FORMAT,
-        _VERSION,
+        layout.folder / CACHE / "stamp.json", _FORMAT, _VERSION,
         {"capture_hash": capture_hash, "fingerprint": _fingerprint(layout)},
-    )
+    )  # fmt: skip
 
 
 def map_frames(layout: FrameLayout, capture_hash: str, digests: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,30 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.camera import Camera
+from mien.capture import from_video
+from mien.capture.cameras import readings
 from mien.capture.cameras.calibration import CalibratedCamera, match_sources, read_calibration
 from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path, project
-from mien.capture.cameras.readings import (
-    Reading,
-    advice_of,
-    is_wrong,
-    landmarks_at,
-    rank_readings,
-    readings_of,
-    some_timesteps,
-    warn_of_misfit,
-)
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FrameLayout
-from mien.capture.from_video import (
-    RECIPE,
-    CaptureJob,
-    capture_once,
-    check_place,
-    cleaning_up,
-    open_job,
-    prepare,
-    read_finished,
-)
 from mien.capture.parts import Part, check_one_size
 from mien.capture.person.backend import detector_entry
 from mien.capture.person.crop import Crop
@@ -58,7 +40,7 @@ a false face, for example in hair seen from behind."""
 @dataclass(frozen=True, eq=False)
 class _View:
     camera_id: str
-    job: CaptureJob
+    job: from_video.CaptureJob
     survey: Survey
     person: Person
     camera: Camera
@@ -68,13 +50,9 @@ class _View:
 
 
 def capture_cameras(
-    sources: Sequence[Path],
-    calibration: Path,
-    out: Path,
-    name: str,
-    settings: CaptureSettings | None = None,
+    sources: Sequence[Path], calibration: Path, out: Path, name: str, settings: CaptureSettings | None = None,
     replace_others: bool = False,
-) -> Capture:
+) -> Capture:  # fmt: skip
     """Capture a head that several calibrated cameras filmed at the same time, as one capture into the folder `out`.
 
     Frame n of all videos is the same moment, after the offsets of the calibration file. The head's path is found from
@@ -96,28 +74,30 @@ def capture_cameras(
 
     def work() -> Capture:
         _check_lengths(jobs, cameras)
-        check_place(out, whole)
-        with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
-            views = _survey_views(jobs, cameras, prepare(survey_folder, whole.key))
+        from_video.check_place(out, whole)
+        with from_video.cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
+            views = _survey_views(jobs, cameras, from_video.prepare(survey_folder, whole.key))
             _capture_views(views, whole, settings, out)
         return read_capture(out)
 
-    return capture_once(out, partial(read_finished, out, whole.key), work)
+    return from_video.capture_once(out, partial(from_video.read_finished, out, whole.key), work)
 
 
-def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool) -> CaptureJob:
+def _job_of(
+    source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool
+) -> from_video.CaptureJob:
     """Return the job of one camera, with its own files of those that settings name."""
     own = {
         option: _file_of(path, camera.camera_id, option.replace("_", "-"))
         for option in ("clean_plate", "mattes", "landmarks")
         if (path := getattr(settings, option)) is not None
     }
-    job = open_job(source, replace(settings, **own), camera.camera_id, replace_others)
+    job = from_video.open_job(source, replace(settings, **own), camera.camera_id, replace_others)
     selection = replace(job.frames.selection, offset=camera.offset)
     return replace(job, frames=replace(job.frames, selection=selection, lens=camera.lens, colors=camera.colors))
 
 
-def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
+def _check_size(job: from_video.CaptureJob, camera: CalibratedCamera) -> None:
     """Check the first picture of a camera, before faces are searched in any."""
     if camera.offset and camera.offset >= job.frames.count():
         raise UserError(
@@ -128,7 +108,7 @@ def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
     camera.for_pictures(width, height)
 
 
-def _check_lengths(jobs: list[CaptureJob], cameras: list[CalibratedCamera]) -> None:
+def _check_lengths(jobs: list[from_video.CaptureJob], cameras: list[CalibratedCamera]) -> None:
     """Check the numbers of frames without decoding any. With --capture.start or --capture.end, times decide."""
     selections = [job.frames.selection for job in jobs]
     if any(selection.start or selection.end for selection in selections):
@@ -160,7 +140,9 @@ def _file_of(folder: Path, camera_id: str, option: str) -> Path:
     return found[0]
 
 
-def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str) -> CaptureJob:
+def _joined(
+    jobs: list[from_video.CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str
+) -> from_video.CaptureJob:
     """Return the job of the whole: the first camera's, under the sequence's name and a key over all of them."""
     rates = [job.frames.fps for job in jobs]
     for camera, rate in zip(cameras, rates, strict=True):
@@ -169,7 +151,7 @@ def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, 
                 f"camera {camera.camera_id} has {rate:g} frames a second, camera {cameras[0].camera_id} {rates[0]:g}; "
                 "frames are paired by their number, so give videos of one rate"
             )
-    content = {"recipe": RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
+    content = {"recipe": from_video.RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
     if any(camera.lens for camera in cameras):
         content["straightened"] = True
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -177,7 +159,7 @@ def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, 
     return replace(jobs[0], frames=replace(jobs[0].frames, content_hash=contents), name=name, key=key)
 
 
-def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
+def _survey_views(jobs: list[from_video.CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
         given = job.given()
@@ -191,7 +173,7 @@ def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folde
     return views
 
 
-def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSettings, out: Path) -> None:
+def _capture_views(views: list[_View], whole: from_video.CaptureJob, settings: CaptureSettings, out: Path) -> None:
     cameras = [view.camera for view in views]
     boxes = np.stack([view.person.boxes * np.tile(view.survey.picture_size, 2) for view in views], axis=1)
     path = find_head_path(boxes, cameras, lambda: _advice(views, boxes))
@@ -206,9 +188,8 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
             "cameras see it; check its calibration, its id and its offset"
         )
     crops, (width, height) = choose_crops(path, cameras, settings.size, settings.crop == "none")
-    work = prepare(partial_folder(out), whole.key)
-    ids = tuple(view.camera_id for view in views)
-    layout = FrameLayout(work, ids, len(path.centers), height, width)
+    work = from_video.prepare(partial_folder(out), whole.key)
+    layout = FrameLayout(work, tuple(view.camera_id for view in views), len(path.centers), height, width)
     check_room(layout, whole.name, out)
     parts, chunks = [], []
     for index, (view, crop) in enumerate(zip(views, crops, strict=True)):
@@ -227,19 +208,19 @@ def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSetti
 
 def _advice(views: list[_View], boxes: Float[np.ndarray, "t c 4"]) -> str:
     """Return what to correct in a calibration that does not fit, found from landmarks in a few pictures."""
-    timesteps = some_timesteps(np.isfinite(boxes[..., 0]))
+    timesteps = readings.some_timesteps(np.isfinite(boxes[..., 0]))
     landmarks = np.full((len(timesteps), len(views), LANDMARKS, 2), np.nan)
     for index, view in enumerate(views):
         given = view.job.given().landmarks
         if given is None:
-            landmarks[:, index] = landmarks_at(view.job.frames, boxes[:, index], timesteps, view.job.detector)
+            landmarks[:, index] = readings.landmarks_at(view.job.frames, boxes[:, index], timesteps, view.job.detector)
         else:
             landmarks[:, index] = given[view.survey.numbers[timesteps]]
-    ranked = rank_readings(landmarks, _readings(views))
-    return advice_of(ranked) if is_wrong(ranked) else ""
+    ranked = readings.rank_readings(landmarks, _readings(views))
+    return readings.advice_of(ranked) if readings.is_wrong(ranked) else ""
 
 
-def _readings(views: list[_View], parts: Sequence[Part] = ()) -> list[Reading]:
+def _readings(views: list[_View], parts: Sequence[Part] = ()) -> list[readings.Reading]:
     """Return how the calibration may be read, for the source's pictures or for the captured parts of them."""
 
     def fitted(index: int, camera: Camera) -> Camera:
@@ -247,23 +228,18 @@ def _readings(views: list[_View], parts: Sequence[Part] = ()) -> list[Reading]:
         return _cropped(camera, parts[index].crop) if parts else camera
 
     return [
-        Reading(reading.remedies, tuple(fitted(*each) for each in enumerate(reading.cameras)))
-        for reading in readings_of([view.calibrated.camera for view in views])
+        readings.Reading(reading.remedies, tuple(fitted(*each) for each in enumerate(reading.cameras)))
+        for reading in readings.readings_of([view.calibrated.camera for view in views])
     ]
 
 
 def _finish(
-    views: list[_View],
-    whole: CaptureJob,
-    path: HeadPath,
-    parts: list[Part],
-    layout: FrameLayout,
-    chunks: list[list[Chunk]],
-    out: Path,
-) -> None:
+    views: list[_View], whole: from_video.CaptureJob, path: HeadPath, parts: list[Part], layout: FrameLayout,
+    chunks: list[list[Chunk]], out: Path,
+) -> None:  # fmt: skip
     cameras = tuple(_cropped(view.camera, part.crop) for view, part in zip(views, parts, strict=True))
     landmarks = join_chunks(chunks, "landmarks")
-    warn_of_misfit(rank_readings(landmarks, _readings(views, parts)))
+    readings.warn_of_misfit(readings.rank_readings(landmarks, _readings(views, parts)))
     _remove_astray(landmarks, path, cameras)
     timestamps, valid = views[0].survey.timestamps, np.isfinite(landmarks[..., 0, 0])
     report = {
@@ -284,18 +260,11 @@ def _finish(
         **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
     }
     finish(
-        layout,
-        out,
-        chunks,
-        report,
-        name=whole.name,
-        fps=frame_rate(timestamps, whole.frames.fps),
-        timestamps=timestamps,
-        landmarks=landmarks,
-        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64),
-        source=source,
+        layout, out, chunks, report, name=whole.name, fps=frame_rate(timestamps, whole.frames.fps),
+        timestamps=timestamps, landmarks=landmarks,
+        principal_point=np.stack([camera.K[:2, 2].numpy() for camera in cameras]).astype(np.float64), source=source,
         calibration=cameras,
-    )
+    )  # fmt: skip
 
 
 def _cropped(camera: Camera, crop: Crop) -> Camera:

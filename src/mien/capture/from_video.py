@@ -108,8 +108,7 @@ def capture_once(folder: Path, read: Callable[[bool], _Result | None], work: Cal
 
 def _capture_whole(out: Path, job: CaptureJob) -> Capture:
     check_place(out, job)
-    scratch = partial_folder(out).with_suffix(".survey")
-    with cleaning_up(out, scratch) as survey_folder:
+    with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
         survey, given = _run_survey(job, survey_folder)
         part = whole_part(survey, job.settings, job.frames.path, job.name)
         draft = _draft(job, enumerate(job.frames.frames()), part, (1, 1), given, out)
@@ -119,12 +118,9 @@ def _capture_whole(out: Path, job: CaptureJob) -> Capture:
 
 
 def capture_video_parts(
-    source: Path,
-    sequences: Path,
-    settings: CaptureSettings | None = None,
-    name: str | None = None,
+    source: Path, sequences: Path, settings: CaptureSettings | None = None, name: str | None = None,
     replace: bool = False,
-) -> list[Capture]:
+) -> list[Capture]:  # fmt: skip
     """Capture a video into `sequences`/NAME/capture, or, if it has cuts, each shot into NAME-1, NAME-2, ...
 
     Each part is captured as by `capture_video`. The source is read only twice, however many parts there are. The
@@ -239,11 +235,8 @@ def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_
     own = asdict(settings) | contents
     del own["detector"]
     content = {
-        "recipe": RECIPE,
-        "source": frames.content_hash,
-        "name": name,
-        "settings": own | detector_entry(detector),
-    }
+        "recipe": RECIPE, "source": frames.content_hash, "name": name, "settings": own | detector_entry(detector),
+    }  # fmt: skip
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     return CaptureJob(frames, settings, name, key, replace_others, detector)
 
@@ -383,17 +376,10 @@ def _finish(job: CaptureJob, draft: Draft, place: tuple[int, int], given: GivenI
         **detector_entry(job.detector if given.landmarks is None else "mediapipe"),
     }
     finish(
-        draft.layout,
-        out,
-        [draft.chunks],
-        report,
-        name=part.name,
-        fps=frame_rate(timestamps, job.frames.fps),
-        timestamps=timestamps,
-        landmarks=landmarks,
-        principal_point=part.crop.to_output(survey.picture_size / 2)[None],
+        draft.layout, out, [draft.chunks], report, name=part.name, fps=frame_rate(timestamps, job.frames.fps),
+        timestamps=timestamps, landmarks=landmarks, principal_point=part.crop.to_output(survey.picture_size / 2)[None],
         source=source,
-    )
+    )  # fmt: skip
 
 
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:

@@ -186,14 +186,9 @@ class PartProcessor:
 
 
 def process_part(
-    stream: Stream,
-    part: Part,
-    given: GivenInputs,
-    layout: FrameLayout,
-    work: Path,
-    camera: int = 0,
+    stream: Stream, part: Part, given: GivenInputs, layout: FrameLayout, work: Path, camera: int = 0,
     detector: DetectorChoice = "auto",
-) -> list[Chunk]:
+) -> list[Chunk]:  # fmt: skip
     """Process a part as one camera of the layout. Chunks that an interrupted call left in `work` are kept."""
     work.mkdir(exist_ok=True)
     paths = {start: work / f"{start:06d}.safetensors" for start in range(0, layout.timesteps, CHUNK)}
@@ -219,12 +214,8 @@ def _own_matte(make: MakeMatte, landmarks: np.ndarray, others: np.ndarray, taken
 
 
 def _finish(
-    image: np.ndarray,
-    make_matte: MakeMatte,
-    landmarks: np.ndarray,
-    quality: np.ndarray,
-    screen: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray]:
+    image: np.ndarray, make_matte: MakeMatte, landmarks: np.ndarray, quality: np.ndarray, screen: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return picture (without a screen) and matte for the disk, and write the picture's quality into `quality`."""
     if np.isfinite(landmarks[0, 0]):
         quality[:] = measure_face(image, landmarks)
@@ -259,13 +250,9 @@ def finish(
     each = [vars(relative_quality(measured[:, camera])) for camera in range(len(chunks))]
     quality = FrameQuality(**{name: np.concatenate([one[name] for one in each], axis=1) for name in each[0]})
     capture = Capture(
-        camera_ids=layout.camera_ids,
-        images=layout.blank(FRAMES),
-        mattes=layout.blank(MATTES),
-        valid=np.isfinite(facts["landmarks"][..., 0, 0]),
-        quality=quality,
-        **facts,
-    )
+        camera_ids=layout.camera_ids, images=layout.blank(FRAMES), mattes=layout.blank(MATTES),
+        valid=np.isfinite(facts["landmarks"][..., 0, 0]), quality=quality, **facts,
+    )  # fmt: skip
     report |= quality_report(capture.name, quality, measured.reshape(-1, MEASURES))
     for entry in layout.folder.iterdir():
         if entry.name not in (FRAMES, MATTES, CACHE):

@@ -9,19 +9,9 @@ import numpy as np
 import torch
 
 from mien.camera import Camera
+from mien.capture import frame_files
 from mien.capture.cameras.calibration import is_file_name
 from mien.capture.capture import Capture
-from mien.capture.frame_files import (
-    CACHE,
-    FRAMES,
-    MATTES,
-    REMEDY,
-    STAGE,
-    FrameLayout,
-    FrameWriter,
-    map_frames,
-    stamp_cache,
-)
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.quality import FrameQuality
 from mien.disk.files import cannot_write, read_arrays, read_json, replace_folder, write_arrays, write_json
@@ -34,7 +24,7 @@ from mien.machine.terminal import counted
 
 FORMAT, VERSION = "mien.capture", 1
 JSON_NAME, ARRAYS_NAME, REPORT_NAME = "capture.json", "landmarks.safetensors", "report.json"
-_OWN_NAMES = frozenset({JSON_NAME, ARRAYS_NAME, REPORT_NAME, FRAMES, MATTES, CACHE})
+_OWN_NAMES = frozenset({JSON_NAME, ARRAYS_NAME, REPORT_NAME, frame_files.FRAMES, frame_files.MATTES, frame_files.CACHE})
 _QUALITY = ("sharpness", "brightness", "clipped")  # arrays that are there if the faces were measured
 _ARRAYS = {
     "timestamps": ("t", np.float64),
@@ -57,8 +47,11 @@ def write_capture(path: Path, capture: Capture) -> str:
     try:
         check_replaceable(path)
         remove_tree(partial)
-        layout = FrameLayout(partial, capture.camera_ids, capture.timesteps, capture.height, capture.width)
-        with FrameWriter(layout) as writer, progress_bar(f"write {capture.name}", capture.timesteps) as advance:
+        layout = frame_files.FrameLayout(partial, capture.camera_ids, capture.timesteps, capture.height, capture.width)
+        with (
+            frame_files.FrameWriter(layout) as writer,
+            progress_bar(f"write {capture.name}", capture.timesteps) as advance,
+        ):
             for timestep in range(capture.timesteps):
                 images, mattes = capture.images[timestep], capture.mattes[timestep]
                 writer.submit(timestep, lambda images=images, mattes=mattes: (images, mattes))
@@ -78,37 +71,29 @@ def _read_capture(path: Path) -> Capture:
     if not path.is_dir():
         raise UserError(f"{path}: no capture there; run `mien capture` first, or check the path")
     check_tree(path)
-    content, arrays = read_json(path / JSON_NAME, FORMAT, VERSION, STAGE), read_arrays(path / ARRAYS_NAME, STAGE)
-    with expect_whole(path / JSON_NAME, REMEDY):
+    content = read_json(path / JSON_NAME, FORMAT, VERSION, frame_files.STAGE)
+    arrays = read_arrays(path / ARRAYS_NAME, frame_files.STAGE)
+    with expect_whole(path / JSON_NAME, frame_files.REMEDY):
         _check(content, arrays)
         camera_ids = tuple(content["camera_ids"])
         width, height = checked_side(content["width"]), checked_side(content["height"])
-        layout = FrameLayout(path, camera_ids, content["timesteps"], height, width)
+        layout = frame_files.FrameLayout(path, camera_ids, content["timesteps"], height, width)
         fps = float(content["fps"])
         belongs = content["capture_hash"] == _hash(layout, fps, arrays)
         calibration = _calibration(arrays, width, height)
         quality = FrameQuality(*(arrays[name] for name in _QUALITY)) if "sharpness" in arrays else None
     if not belongs:
-        raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {REMEDY}")
-    digests = {FRAMES: arrays["frame_digests"], MATTES: arrays["matte_digests"]}
-    images, mattes = map_frames(layout, content["capture_hash"], digests)
+        raise UserError(f"{path / ARRAYS_NAME}: does not belong to the {JSON_NAME} beside it; {frame_files.REMEDY}")
+    digests = {frame_files.FRAMES: arrays["frame_digests"], frame_files.MATTES: arrays["matte_digests"]}
+    images, mattes = frame_files.map_frames(layout, content["capture_hash"], digests)
     if read_capture_hash(path) != content["capture_hash"]:
         # The folder was replaced while it was mapped, so the maps may be of two captures.
         raise UserError(f"{path}: was replaced while it was read; run the same command again")
     return Capture(
-        name=content["name"],
-        camera_ids=camera_ids,
-        fps=fps,
-        timestamps=arrays["timestamps"],
-        images=images,
-        mattes=mattes,
-        landmarks=arrays["landmarks"],
-        valid=arrays["valid"],
-        principal_point=arrays["principal_point"],
-        source=content["source"],
-        calibration=calibration,
-        quality=quality,
-    )
+        name=content["name"], camera_ids=camera_ids, fps=fps, timestamps=arrays["timestamps"], images=images,
+        mattes=mattes, landmarks=arrays["landmarks"], valid=arrays["valid"], principal_point=arrays["principal_point"],
+        source=content["source"], calibration=calibration, quality=quality,
+    )  # fmt: skip
 
 
 def _calibration(arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[Camera, ...] | None:
@@ -123,7 +108,7 @@ def _calibration(arrays: dict[str, np.ndarray], width: int, height: int) -> tupl
 
 def read_capture_hash(path: Path) -> str:
     """Return the hash over pixels, mattes, landmarks, times and cameras of a capture, without reading them."""
-    return str(read_json(path / JSON_NAME, FORMAT, VERSION, STAGE).get("capture_hash"))
+    return str(read_json(path / JSON_NAME, FORMAT, VERSION, frame_files.STAGE).get("capture_hash"))
 
 
 def partial_folder(path: Path) -> Path:
@@ -143,12 +128,9 @@ def check_replaceable(path: Path) -> None:
 
 
 def finish_capture(
-    layout: FrameLayout,
-    path: Path,
-    capture: Capture,
-    digests: dict[str, np.ndarray],
+    layout: frame_files.FrameLayout, path: Path, capture: Capture, digests: dict[str, np.ndarray],
     report: dict[str, Any] | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """Write the files beside the frames, which are in the layout's folder, rename it to `path` and return the hash."""
     folder = layout.folder
     arrays = _arrays(capture, digests)
@@ -156,17 +138,11 @@ def finish_capture(
     write_arrays(folder / ARRAYS_NAME, arrays)
     if report is not None:
         write_json(folder / REPORT_NAME, "mien.capture_report", 1, report)
-    stamp_cache(layout, capture_hash)
+    frame_files.stamp_cache(layout, capture_hash)
     content = {
-        "name": capture.name,
-        "camera_ids": list(capture.camera_ids),
-        "fps": capture.fps,
-        "timesteps": layout.timesteps,
-        "width": layout.width,
-        "height": layout.height,
-        "capture_hash": capture_hash,
-        "source": capture.source,
-    }
+        "name": capture.name, "camera_ids": list(capture.camera_ids), "fps": capture.fps, "timesteps": layout.timesteps,
+        "width": layout.width, "height": layout.height, "capture_hash": capture_hash, "source": capture.source,
+    }  # fmt: skip
     write_json(folder / JSON_NAME, FORMAT, VERSION, content)
     replace_folder(path, folder)
     return capture_hash
@@ -174,13 +150,10 @@ def finish_capture(
 
 def _arrays(capture: Capture, digests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     arrays = {
-        "timestamps": capture.timestamps,
-        "landmarks": capture.landmarks,
-        "valid": capture.valid,
-        "principal_point": capture.principal_point,
-        "frame_digests": digests[FRAMES],
-        "matte_digests": digests[MATTES],
-    }
+        "timestamps": capture.timestamps, "landmarks": capture.landmarks, "valid": capture.valid,
+        "principal_point": capture.principal_point, "frame_digests": digests[frame_files.FRAMES],
+        "matte_digests": digests[frame_files.MATTES],
+    }  # fmt: skip
     if capture.calibration is not None:
         arrays["K"] = np.stack([camera.K.numpy() for camera in capture.calibration])
         arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in capture.calibration])
@@ -189,7 +162,7 @@ def _arrays(capture: Capture, digests: dict[str, np.ndarray]) -> dict[str, np.nd
     return {name: array.astype(_ARRAYS[name][1]) for name, array in arrays.items()}
 
 
-def _hash(layout: FrameLayout, fps: float, arrays: dict[str, np.ndarray]) -> str:
+def _hash(layout: frame_files.FrameLayout, fps: float, arrays: dict[str, np.ndarray]) -> str:
     digest = hashlib.sha256(repr((layout.camera_ids, fps, layout.height, layout.width)).encode())
     for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.shape};".encode())
@@ -224,13 +197,13 @@ _PNG_SHARE = 0.5
 """Size of lossless PNGs relative to their pixels. Footage takes 0.2 to 0.5 of them, mattes almost nothing."""
 
 
-def capture_bytes(layout: FrameLayout) -> int:
+def capture_bytes(layout: frame_files.FrameLayout) -> int:
     """Estimate the room that a capture takes on disk, in bytes: the decoded pixels and the PNGs."""
-    frames, mattes = layout.raw_size(FRAMES), layout.raw_size(MATTES)
+    frames, mattes = layout.raw_size(frame_files.FRAMES), layout.raw_size(frame_files.MATTES)
     return frames + mattes + round(_PNG_SHARE * frames)
 
 
-def check_room(layout: FrameLayout, name: str, out: Path) -> None:
+def check_room(layout: frame_files.FrameLayout, name: str, out: Path) -> None:
     """Say how much room a capture takes, before its pictures are written. Files of an interrupted run count as room."""
     cameras, size = len(layout.camera_ids), f"{layout.width}x{layout.height}"
     what = f"{counted(layout.timesteps, 'frame')} of {size}" + (f" by {cameras} cameras" if cameras > 1 else "")

@@ -84,8 +84,7 @@ def with_coefficients(
         head_rotation=torch.from_numpy(axis_angles(AXES @ rotations)).float(),
         head_translation=torch.from_numpy(translations @ AXES).float(),
     )
-    size = capture.images.shape[3], capture.images.shape[2]
-    camera = {capture.camera_ids[0]: camera_of(K, FRONT, size)}
+    camera = {capture.camera_ids[0]: camera_of(K, FRONT, (capture.images.shape[3], capture.images.shape[2]))}
     tracked = tracked_sequence(
         path, capture.name, capture.images, capture.mattes, camera, face_model, face, capture.fps
     )

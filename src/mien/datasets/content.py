@@ -46,6 +46,18 @@ def frames_of(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
     return frames
 
 
+def read_frames(path: Path) -> list[dict[str, Any]]:
+    """Read the list `frames` of a json file."""
+    return frames_of(path, read_object(path))
+
+
+def pictures_of(
+    path: Path, root: Path, frames: Sequence[Mapping[str, Any]], endings: Sequence[str] = ("",)
+) -> list[Path]:
+    """Return the files inside `root` that each frame of a json file names as its picture (`inner`)."""
+    return [inner(path, root, frame.get("file_path"), endings) for frame in frames]
+
+
 def numbers(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
     """Return an entry of a json object as a float64 array.
 

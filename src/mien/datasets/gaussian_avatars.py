@@ -25,9 +25,6 @@ def _read(path: Path, face_model: "FaceModel | None") -> TrainedAvatar:
 
 
 GAUSSIAN_AVATARS = Dataset(
-    "gaussian-avatars",
-    "the folder of a trained avatar with point_cloud.ply and flame_param.npz",
-    "avatar",
-    _recognises,
-    _read,
-)
+    "gaussian-avatars", "the folder of a trained avatar with point_cloud.ply and flame_param.npz", "avatar",
+    _recognises, _read,
+)  # fmt: skip

@@ -6,12 +6,13 @@ OpenGL-like axes and a first intrinsic that is negative, which together give no 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, sniff, stacked, stacked_poses
+from mien.datasets import content
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
 
@@ -46,7 +47,7 @@ class _Clip:
 def _files(path: Path) -> list[Path]:
     """The json files of the clips: in the folder itself, in its clips, or with the subject's name twice."""
     for pattern in (_FILE, f"*/{_FILE}", f"*/*/{_FILE}"):
-        found = sorted(each for each in path.glob(pattern) if b'"world_mat"' in sniff(each))
+        found = sorted(each for each in path.glob(pattern) if b'"world_mat"' in content.sniff(each))
         if found:
             return found
     return []
@@ -60,10 +61,10 @@ def _recognises(path: Path) -> str | None:
 
 
 def _clips(path: Path) -> list[_Clip]:
-    contents = {file: read_object(file) for file in _files(path)}
-    clips = [_Clip(file, content, frames_of(file, content)) for file, content in contents.items()]
+    contents = {file: content.read_object(file) for file in _files(path)}
+    clips = [_Clip(file, values, content.frames_of(file, values)) for file, values in contents.items()]
     if not clips:
-        raise UserError(f"{path}: has no {_FILE} with world_mat; {REMEDY}")
+        raise UserError(f"{path}: has no {_FILE} with world_mat; {content.REMEDY}")
     names = [clip.name for clip in clips]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -113,13 +114,13 @@ def camera_from_imavatar(intrinsics: np.ndarray, size: tuple[int, int]) -> np.nd
 def _pictures(clip: _Clip, root: Path) -> tuple[np.ndarray, np.ndarray]:
     from mien.datasets.pictures import read_matte, read_one_camera
 
-    places = [inner(clip.file, root, frame.get("file_path"), _ENDINGS) for frame in clip.frames]
+    places = content.pictures_of(clip.file, root, clip.frames, _ENDINGS)
 
     def matte(timestep: int, opacity: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
         name = f"mask/{places[timestep].name}"
         if opacity is not None and not (clip.file.parent / name).exists():
             return opacity
-        return read_matte(inner(clip.file, root, name), size)
+        return read_matte(content.inner(clip.file, root, name), size)
 
     return read_one_camera(places, clip.name, matte)
 
@@ -132,9 +133,8 @@ def _clothes(clip: _Clip, root: Path, size: tuple[int, int]) -> dict[str, np.nda
     if not (clip.file.parent / "semantic").is_dir():
         return {}
     masks = []
-    for frame in clip.frames:
-        name = inner(clip.file, root, frame.get("file_path"), _ENDINGS).with_suffix(".png").name
-        classes = read_matte(inner(clip.file, root, f"semantic/{name}"), size)
+    for place in content.pictures_of(clip.file, root, clip.frames, _ENDINGS):
+        classes = read_matte(content.inner(clip.file, root, f"semantic/{place.with_suffix('.png').name}"), size)
         masks.append(packed_clothes(np.isin(classes, _CLOTHES)[None]))
     return {name: np.concatenate([mask[name] for mask in masks]) for name in masks[0]}
 
@@ -143,50 +143,35 @@ def _face(clip: _Clip, model: "FaceModel") -> "FaceParams":
     from mien.datasets.flame_poses import carried, face_of_flame
 
     file, frames = clip.file, clip.frames
-    poses, mats = stacked(file, frames, "pose", (15,)), stacked_poses(file, frames, "world_mat", (3, 4))
+    poses, mats = content.stacked(file, frames, "pose", (15,)), content.stacked_poses(file, frames, "world_mat", (3, 4))
     arrays = {
-        "shape": numbers(file, clip.content, "shape_params", (None,)),
-        "expr": stacked(file, frames, "expression", (50,)),
+        "shape": content.numbers(file, clip.content, "shape_params", (None,)),
+        "expr": content.stacked(file, frames, "expression", (50,)),
         "rotation": poses[:, :3], "neck_pose": poses[:, 3:6], "jaw_pose": poses[:, 6:9], "eyes_pose": poses[:, 9:],
     }  # fmt: skip
     # The cameras' axes are those of the world of `flame_poses.FRONT`, because OpenCV's axes are turned twice.
     return carried(face_of_flame(file, model, arrays), mats[:, :3, :3], mats[:, :3, 3] / _SCALE)
 
 
-def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
-    from mien.datasets.flame_poses import FRONT, camera_of
+def _read(path: Path, face_model: "FaceModel | None" = None, *, tracked: bool = True) -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of, needed_flame
     from mien.datasets.sequences import sequence_of
     from mien.training.settings.splits import OwnSplit
 
-    clips = _clips(path)
+    model, clips = needed_flame(path, face_model, _VERSION) if tracked else None, _clips(path)
     held = _held_out(clips)
     for clip in clips:
-        tracked = None if model is None else (model, _face(clip, model))
+        face = None if model is None else (model, _face(clip, model))
         images, mattes = _pictures(clip, path)
         size = images.shape[3], images.shape[2]
-        K = camera_from_imavatar(numbers(clip.file, clip.content, "intrinsics", (4,)), size)
+        K = camera_from_imavatar(content.numbers(clip.file, clip.content, "intrinsics", (4,)), size)
         camera = {"0": camera_of(K, FRONT, size)}
-        sequence = sequence_of(clip.file, clip.name, (images, mattes), camera, _FPS, tracked, _VERSION)
+        sequence = sequence_of(clip.file, clip.name, (images, mattes), camera, _FPS, face, _VERSION)
         split = OwnSplit(held[clip.name]) if held else None
         yield replace(sequence, own_split=split, foreign=_clothes(clip, path, size))
 
 
-def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    from mien.datasets.flame_poses import needed_flame
-
-    return _sequences(path, needed_flame(path, face_model, _VERSION))
-
-
-def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    return _sequences(path, None)
-
-
 IMAVATAR = Dataset(
-    "imavatar",
-    "a subject of IMavatar, PointAvatar, MonoGaussianAvatar or SplattingAvatar with flame_params.json",
-    "sequences",
-    _recognises,
-    _read,
-    _survey,
-    _read_pictures,
-)
+    "imavatar", "a subject of IMavatar, PointAvatar, MonoGaussianAvatar or SplattingAvatar with flame_params.json",
+    "sequences", _recognises, _read, _survey, partial(_read, tracked=False),
+)  # fmt: skip

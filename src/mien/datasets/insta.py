@@ -17,19 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mien.datasets.content import (
-    REMEDY,
-    check_file_inside,
-    frames_of,
-    inner,
-    numbered_files,
-    numbers,
-    png_has_opacity,
-    read_object,
-    scalars,
-    sniff,
-    stacked_poses,
-)
+from mien.datasets import content
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
 from mien.machine.terminal import counted
@@ -49,8 +37,6 @@ _MASKS = "image_mask"
 
 @dataclass(frozen=True)
 class _Frame:
-    """The files of one frame."""
-
     picture: Path
     matte: Path | None
     """A separate matte. None if the picture has an opacity."""
@@ -73,16 +59,16 @@ class _Layout:
     @property
     def is_bare(self) -> bool:
         """Whether there are neither mattes nor opacities, so that mien makes the mattes."""
-        return self.kind == "INSTA" and not png_has_opacity(self.frames[0].picture)
+        return self.kind == "INSTA" and not content.png_has_opacity(self.frames[0].picture)
 
 
 def _recognises(path: Path) -> str | None:
     if _flash_avatar(path) is not None:
         return "FlashAvatar's folders with checkpoints of metrical-tracker"
-    head = sniff(path / "transforms.json")
+    head = content.sniff(path / "transforms.json")
     if b'"exp_path"' in head and b'"timestep_index"' not in head and b'"flame_param_path"' not in head:
         return "a subject of INSTA's data set"
-    if any((path / name).is_dir() for name in _FOLDERS) and numbered_files(path / "checkpoint", ".frame"):
+    if any((path / name).is_dir() for name in _FOLDERS) and content.numbered_files(path / "checkpoint", ".frame"):
         return "pictures with checkpoints of metrical-tracker"
     return None
 
@@ -101,29 +87,27 @@ def _layout(path: Path) -> _Layout:
     flash = _flash_avatar(path)
     if flash is not None:
         folder, checkpoints = flash
-        pictures = numbered_files(folder / "imgs", ".jpg") or numbered_files(folder / "imgs", ".png")
-        mattes = numbered_files(folder / "alpha", ".jpg") or numbered_files(folder / "alpha", ".png")
-        saved = {number + 1: place for number, place in numbered_files(checkpoints, ".frame").items()}
+        pictures = content.numbered_files(folder / "imgs", ".jpg") or content.numbered_files(folder / "imgs", ".png")
+        mattes = content.numbered_files(folder / "alpha", ".jpg") or content.numbered_files(folder / "alpha", ".png")
+        saved = {number + 1: place for number, place in content.numbered_files(checkpoints, ".frame").items()}
         return _paired("FlashAvatar", folder, checkpoints.parents[3], pictures, mattes, saved)
-    saved = numbered_files(path / "checkpoint", ".frame")
+    saved = content.numbered_files(path / "checkpoint", ".frame")
     if (path / "transforms.json").exists():
         file = path / "transforms.json"
-        listed = [inner(file, path, frame.get("file_path")) for frame in frames_of(file, read_object(file))]
         pictures = {
             int(place.stem) if place.stem.isascii() and place.stem.isdigit() else number: place
-            for number, place in enumerate(listed)
+            for number, place in enumerate(content.pictures_of(file, path, content.read_frames(file)))
         }
         return _with_test(path / _TEST, _paired("INSTA", path, path, pictures, {}, saved))
     folder = next((path / name for name in _FOLDERS if (path / name).is_dir()), path / _FOLDERS[0])
-    pictures, masks = numbered_files(folder, ".png"), numbered_files(path / _MASKS, ".png", "mask_")
+    pictures, masks = content.numbered_files(folder, ".png"), content.numbered_files(path / _MASKS, ".png", "mask_")
     return _paired("NeRFBlendShape" if masks else "INSTA", path, path, pictures, masks, saved)
 
 
 def _with_test(file: Path, layout: _Layout) -> _Layout:
-    """The layout with the split of transforms_test.json, if it is there."""
     if not file.exists():
         return layout
-    held = {inner(file, layout.root, frame.get("file_path")) for frame in frames_of(file, read_object(file))}
+    held = set(content.pictures_of(file, layout.root, content.read_frames(file)))
     test = tuple(index for index, frame in enumerate(layout.frames) if frame.picture in held)
     return replace(layout, test=test, split=f"{counted(len(test), 'frame')} of {_TEST} are held out")
 
@@ -137,7 +121,7 @@ def _paired(
     if not both:
         raise UserError(f"{folder}: no picture has the number of a checkpoint; copy the files of the dataset again")
     for place in (*pictures.values(), *mattes.values(), *saved.values()):
-        check_file_inside(root, place)
+        content.check_file_inside(root, place)
     frames = tuple(_Frame(pictures[number], mattes.get(number), saved.get(number)) for number in both)
     last = TEST_FRAMES[kind] if len(frames) > TEST_FRAMES[kind] else 0
     test, split = tuple(range(len(frames) - last, len(frames))), f"the last {last} frames are held out ({kind})"
@@ -238,7 +222,9 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     elif _checkpoints(layout):
         K, tracked = read_tracker_camera(_checkpoints(layout))
     else:
-        raise UserError(f"{file}: is missing, and there are no checkpoints, so the camera is not known; {REMEDY}")
+        raise UserError(
+            f"{file}: is missing, and there are no checkpoints, so the camera is not known; {content.REMEDY}"
+        )
     camera = {"0": camera_of(scaled_to_pictures(path, K, tracked, size), FRONT, size)}
     sequence = filmed_sequence(path, layout.name, *_pictures(layout), camera, _FPS)
     yield replace(sequence, foreign=poses, own_split=_own_split(layout))
@@ -248,10 +234,10 @@ def _transforms(file: Path) -> tuple[np.ndarray, tuple[int, int] | None, dict[st
     """Intrinsics, width and height that they are for, and poses of transforms.json."""
     from mien.datasets.flame_poses import pinhole
 
-    content = read_object(file)
-    K = pinhole(*scalars(file, content, "fl_x", "fl_y", "cx", "cy"))
-    width, height = (int(numbers(file, content, name, ())) if name in content else 0 for name in ("w", "h"))
-    poses = stacked_poses(file, frames_of(file, content), "transform_matrix")
+    values = content.read_object(file)
+    K = pinhole(*content.scalars(file, values, "fl_x", "fl_y", "cx", "cy"))
+    width, height = (int(content.numbers(file, values, name, ())) if name in values else 0 for name in ("w", "h"))
+    poses = content.stacked_poses(file, content.frames_of(file, values), "transform_matrix")
     size = (width, height) if width > 0 and height > 0 else None
     return K, size, {"camera_to_head": poses.astype(np.float32)}
 
@@ -259,9 +245,5 @@ def _transforms(file: Path) -> tuple[np.ndarray, tuple[int, int] | None, dict[st
 INSTA = Dataset(
     "insta",
     "a subject of INSTA, FlashAvatar, GaussianBlendshapes or RGBAvatar: images and checkpoints of metrical-tracker",
-    "sequences",
-    _recognises,
-    _read,
-    _survey,
-    _read_pictures,
-)
+    "sequences", _recognises, _read, _survey, _read_pictures,
+)  # fmt: skip

@@ -98,7 +98,6 @@ def _camera(place: Path, arrays: dict[str, np.ndarray]) -> TrackerCamera:
 
 
 def _read_frame(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of one checkpoint, checked."""
     with readable(path, "a checkpoint of metrical-tracker", REMEDY):
         with open_ordinary(path) as file, open_archive(file) as archive:
             members = [member for member in archive.infolist() if member.filename.endswith("data.pkl")]

@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mien.datasets.content import (
-    REMEDY,
-    frames_of,
-    inner,
-    is_file_inside,
-    read_object,
-    scalars,
-    sniff,
-    stacked,
-    stacked_poses,
-)
+from mien.datasets import content
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.errors import UserError
 
@@ -36,20 +26,20 @@ _HEAD = (0, 0, 255)  # colour of the head in the parsing, as red, green and blue
 
 
 def _recognises(path: Path) -> str | None:
-    return "a person of NeRFBlendShape" if b'"exp_ori"' in sniff(path / _FILE) else None
+    return "a person of NeRFBlendShape" if b'"exp_ori"' in content.sniff(path / _FILE) else None
 
 
 def _frames(path: Path) -> tuple[dict[str, Any], list[tuple[int, dict[str, Any]]]]:
     """The json file, and its frames by the numbers of their pictures, in increasing order."""
     file = path / _FILE
-    content = read_object(file)
+    values = content.read_object(file)
     found: dict[int, dict[str, Any]] = {}
-    for number, frame in enumerate(frames_of(file, content)):
+    for number, frame in enumerate(content.frames_of(file, values)):
         img_id = frame.get("img_id")
         if type(img_id) is not int or img_id < 0 or img_id in found:
-            raise UserError(f"{file}: frame {number} has no 'img_id' of its own; {REMEDY}")
+            raise UserError(f"{file}: frame {number} has no 'img_id' of its own; {content.REMEDY}")
         found[img_id] = frame
-    return content, sorted(found.items())
+    return values, sorted(found.items())
 
 
 def _survey(path: Path) -> Findings:
@@ -69,15 +59,14 @@ def _read_landmarks(root: Path, path: Path) -> np.ndarray:
     """The 478 points of a .lms file in pixels; NaN if the file is missing."""
     from mien.disk.reading import read_bytes
 
-    if not is_file_inside(root, path):
+    if not content.is_file_inside(root, path):
         return np.full((_LANDMARKS, 2), np.nan)
     try:
-        text = read_bytes(path, 1 << 20).decode("ascii")
-        points = np.array(text.split(), np.float64).reshape(-1, 2)
+        points = np.array(read_bytes(path, 1 << 20).decode("ascii").split(), np.float64).reshape(-1, 2)
     except (OSError, ValueError):
         points = np.zeros((0, 2))
     if points.shape != (_LANDMARKS, 2) or not np.abs(points).max() < 1e6:
-        raise UserError(f"{path}: does not hold {_LANDMARKS} points; {REMEDY}")
+        raise UserError(f"{path}: does not hold {_LANDMARKS} points; {content.REMEDY}")
     return points
 
 
@@ -88,25 +77,24 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
     from mien.training.settings.splits import OwnSplit
 
     file = path / _FILE
-    content, numbered = _frames(path)
+    values, numbered = _frames(path)
     frames = [frame for _, frame in numbered]
     folder = "ori_imgs" if (path / "ori_imgs").is_dir() else "head_imgs"
-    places = [inner(file, path, f"{folder}/{number}", (".jpg", ".png")) for number, _ in numbered]
+    places = [content.inner(file, path, f"{folder}/{number}", (".jpg", ".png")) for number, _ in numbered]
 
     def matte(timestep: int, opacity: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
-        classes = read_picture(inner(file, path, f"parsing/{numbered[timestep][0]}", (".png",)), size)[0]
+        classes = read_picture(content.inner(file, path, f"parsing/{numbered[timestep][0]}", (".png",)), size)[0]
         return (classes == _HEAD).all(-1).astype(np.uint8) * 255
 
     images, mattes = read_one_camera(places, path.name, matte if (path / "parsing").is_dir() else None)
     landmarks = np.stack([_read_landmarks(path, place.with_suffix(".lms")) for place in places])[:, None]
     given = landmarks.astype(np.float32) if np.isfinite(landmarks).any() else None
-    fx, fy, cx, cy = scalars(file, content, "fx", "fy", "cx", "cy")
+    fx, fy, cx, cy = content.scalars(file, values, "fx", "fy", "cx", "cy")
     # Rays go through whole pixels there, which are the corners of pixels here.
-    K = pinhole(fx, fy, cx + 0.5, cy + 0.5)
-    camera = {"0": camera_of(K, FRONT, (images.shape[3], images.shape[2]))}
+    camera = {"0": camera_of(pinhole(fx, fy, cx + 0.5, cy + 0.5), FRONT, (images.shape[3], images.shape[2]))}
     foreign = {
-        "expression": stacked(file, frames, "exp_ori", (_COEFFICIENTS,)),
-        "head_to_camera": viewmats_from_opengl(stacked_poses(file, frames, "transform_matrix")),
+        "expression": content.stacked(file, frames, "exp_ori", (_COEFFICIENTS,)),
+        "head_to_camera": viewmats_from_opengl(content.stacked_poses(file, frames, "transform_matrix")),
     }
     count = len(frames)
     sequence = filmed_sequence(path, path.name, images, mattes, camera, _FPS, given)

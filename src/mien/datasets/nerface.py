@@ -11,17 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mien.datasets.content import (
-    REMEDY,
-    check_file_inside,
-    frames_of,
-    inner,
-    numbers,
-    read_object,
-    sniff,
-    stacked,
-    stacked_poses,
-)
+from mien.datasets import content
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.disk.reading import listed
 from mien.errors import UserError
@@ -41,16 +31,14 @@ def _file(path: Path, part: str) -> Path:
 
 
 def _recognises(path: Path) -> str | None:
-    head = sniff(_file(path, "train"))
+    head = content.sniff(_file(path, "train"))
     return "a person of NeRFace" if b'"intrinsics"' in head and b'"expression"' in head else None
 
 
 def _clips(path: Path) -> dict[str, list[dict[str, Any]]]:
     """The frames of each clip, in the order of the files."""
     files = {clip: _file(path, clip) for clip in _CLIPS}
-    return {
-        clip: frames_of(file, read_object(file)) for clip, file in files.items() if clip == "train" or file.exists()
-    }
+    return {clip: content.read_frames(file) for clip, file in files.items() if clip == "train" or file.exists()}
 
 
 def _in_time(path: Path, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -58,18 +46,16 @@ def _in_time(path: Path, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     A row of it has the number of a picture of the whole clip, and its number among the training pictures or -1.
     """
-    from mien.datasets.content import read_npy
-
     file = path / "index_map.npy"
     if not file.exists():
         return frames
-    index = read_npy(file)
+    index = content.read_npy(file)
     if index.ndim != 2 or index.shape[1] != 2 or index.dtype.kind not in "iuf":
-        raise UserError(f"{file}: has the shape {list(index.shape)}, not [n, 2]; {REMEDY}")
+        raise UserError(f"{file}: has the shape {list(index.shape)}, not [n, 2]; {content.REMEDY}")
     rows = index[index[:, 1] >= 0]
     order = rows[rows[:, 0].argsort(kind="stable"), 1]
     if sorted(order.tolist()) != list(range(len(frames))):
-        raise UserError(f"{file}: does not list each of the {len(frames)} training pictures once; {REMEDY}")
+        raise UserError(f"{file}: does not list each of the {len(frames)} training pictures once; {content.REMEDY}")
     return [frames[int(number)] for number in order]
 
 
@@ -85,11 +71,9 @@ def _survey(path: Path) -> Findings:
     if "test" not in clips:
         missing.append("transforms_test.json")
     return Findings(
-        tuple(Clip(name, len(frames)) for name, frames in clips.items()),
-        None,
-        "the clip test is held out" if "test" in clips else None,
-        tuple(missing),
-    )
+        tuple(Clip(name, len(frames)) for name, frames in clips.items()), None,
+        "the clip test is held out" if "test" in clips else None, tuple(missing),
+    )  # fmt: skip
 
 
 def _plates(path: Path) -> list[Path]:
@@ -126,15 +110,15 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
 
     plate = next(iter(_plates(path)), None)
     if plate is not None:
-        check_file_inside(path, plate)
+        content.check_file_inside(path, plate)
     for name, given in _clips(path).items():
         file, frames = _file(path, name), _in_time(path, given) if name == "train" else given
-        places = [inner(file, path, frame.get("file_path"), _ENDINGS) for frame in frames]
-        intrinsics = numbers(file, read_object(file), "intrinsics", (4,))
+        places = content.pictures_of(file, path, frames, _ENDINGS)
+        intrinsics = content.numbers(file, content.read_object(file), "intrinsics", (4,))
         images, mattes = read_one_camera(places, name, None, plate)
         size = images.shape[3], images.shape[2]
-        poses = stacked_poses(file, frames, "transform_matrix")
-        expression = stacked(file, frames, "expression", (_EXPRESSIONS,))
+        poses = content.stacked_poses(file, frames, "transform_matrix")
+        expression = content.stacked(file, frames, "expression", (_EXPRESSIONS,))
         foreign = {"expression": expression, "head_to_camera": viewmats_from_nerface(poses, float(intrinsics[0]))}
         camera = {"0": camera_of(camera_from_nerface(intrinsics, size), FRONT, size)}
         sequence = filmed_sequence(path, name, images, mattes, camera, _FPS)

@@ -22,7 +22,6 @@ from mien.errors import UserError
 
 if TYPE_CHECKING:
     from mien.camera import Camera
-    from mien.face.model import FaceModel
 
 SIZE = (2200, 3208)
 """Width and height that the intrinsics are for."""
@@ -110,10 +109,7 @@ def _survey(path: Path) -> Findings:
         videos = sorted((path / "sequences" / name / "images").glob("cam_*.mp4"))
         frames = frames_in(video for video in videos if is_file_inside(path, video))
         clips.append(Clip(name, None if frames is None else -(-frames // _STRIDE), len(videos)))
-    missing = [
-        "two of three frames",
-        "mattes and tracking: `mien capture` and `mien track` make them",
-    ]
+    missing = ["two of three frames", "mattes and tracking: `mien capture` and `mien track` make them"]
     colors = path / _COLORS
     if not colors.is_file():
         missing.append(f"colour correction ({_COLORS}): cameras differ in their colours without it")
@@ -135,17 +131,14 @@ def _read_pictures(path: Path) -> Iterator[ReadSequence]:
         if unknown:
             raise UserError(f"{path / CALIBRATION}: has no camera {unknown[0]}, of which {name} has a video; {REMEDY}")
         yield Footage(
-            name,
-            tuple(videos.values()),
-            {serial: cameras[serial] for serial in videos},
+            name, tuple(videos.values()), {serial: cameras[serial] for serial in videos},
             clean_plates=_plates(path, videos),
             color_corrections=partial(_corrections, path, tuple(videos)) if is_file_inside(path, colors) else None,
             stride=_STRIDE,
-        )
+        )  # fmt: skip
 
 
 def _corrections(path: Path, serials: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return the corrections of these cameras."""
     from mien.media.color_correction import color_correction
 
     file = path / _COLORS
@@ -163,11 +156,7 @@ def _plates(path: Path, videos: dict[str, Path]) -> "dict[str, Path] | None":
     return plates if all(is_file_inside(path, plate) for plate in plates.values()) else None
 
 
-def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    return _read_pictures(path)
-
-
 NERSEMBLE = Dataset(
     "nersemble", "a person's folder of NeRSemble's raw recordings: calibration and sequences", "sequences", _recognises,
-    _read, _survey, _read_pictures,
+    lambda path, face_model: _read_pictures(path), _survey, _read_pictures,
 )  # fmt: skip

@@ -49,11 +49,9 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def read_one_camera(
-    places: Sequence[Path],
-    name: str,
-    matte_of: Callable[[int, Matte | None, tuple[int, int]], Matte] | None,
+    places: Sequence[Path], name: str, matte_of: Callable[[int, Matte | None, tuple[int, int]], Matte] | None,
     plate: Path | None = None,
-) -> tuple[UInt8[np.ndarray, "t 1 h w 3"], UInt8[np.ndarray, "t 1 h w"]]:
+) -> tuple[UInt8[np.ndarray, "t 1 h w 3"], UInt8[np.ndarray, "t 1 h w"]]:  # fmt: skip
     """Read the pictures of one camera, and their mattes.
 
     `places` are in the order of time, and all have the size of the first. `matte_of` returns the matte of a timestep,

@@ -28,15 +28,9 @@ _LANDMARKS = "mediapipe"
 
 @torch.no_grad()
 def tracked_sequence(
-    path: Path,
-    name: str,
-    images: UInt8[np.ndarray, "t c h w 3"],
-    mattes: UInt8[np.ndarray, "t c h w"],
-    cameras: Mapping[str, Camera],
-    face_model: FaceModel,
-    face: FaceParams,
-    fps: float,
-) -> TrackedSequence:
+    path: Path, name: str, images: UInt8[np.ndarray, "t c h w 3"], mattes: UInt8[np.ndarray, "t c h w"],
+    cameras: Mapping[str, Camera], face_model: FaceModel, face: FaceParams, fps: float,
+) -> TrackedSequence:  # fmt: skip
     """Return a sequence whose every frame is tracked.
 
     Landmarks are those of the face model, projected, because no dataset has the points of mien's detector. Residuals
@@ -63,26 +57,17 @@ def tracked_sequence(
     landmarks, valid = _landmarks(face_model, face, views), np.ones(mattes.shape[:2], bool)
     capture = _capture(path, name, images, mattes, cameras, fps, landmarks, valid, {})
     tracking = Tracking(
-        face_model=face_model.name,
-        face_model_hash=face_model.content_hash,
-        face=face,
-        valid=torch.ones(len(mattes), dtype=torch.bool),
-        cameras=views,
-        neck_lines=fit_neck_lines(face_model, face, views),
-        residuals=torch.zeros(mattes.shape[:2]),
-    )
+        face_model=face_model.name, face_model_hash=face_model.content_hash, face=face,
+        valid=torch.ones(len(mattes), dtype=torch.bool), cameras=views,
+        neck_lines=fit_neck_lines(face_model, face, views), residuals=torch.zeros(mattes.shape[:2]),
+    )  # fmt: skip
     return TrackedSequence(capture, tracking, face_model)
 
 
 def filmed_sequence(
-    path: Path,
-    name: str,
-    images: UInt8[np.ndarray, "t c h w 3"],
-    mattes: UInt8[np.ndarray, "t c h w"],
-    cameras: Mapping[str, Camera],
-    fps: float,
-    landmarks: Float[np.ndarray, "t c l 2"] | None = None,
-) -> FilmedSequence:
+    path: Path, name: str, images: UInt8[np.ndarray, "t c h w 3"], mattes: UInt8[np.ndarray, "t c h w"],
+    cameras: Mapping[str, Camera], fps: float, landmarks: Float[np.ndarray, "t c l 2"] | None = None,
+) -> FilmedSequence:  # fmt: skip
     """Return a sequence without a tracking, for `mien track`: the arguments are those of `tracked_sequence`.
 
     `landmarks` are the 478 points of mien's detector in pixels, or None to detect them. A face with NaN is not valid.
@@ -103,18 +88,11 @@ def _capture(
 ) -> Capture:  # fmt: skip
     views = tuple(cameras.values())
     return Capture(
-        name=name,
-        camera_ids=tuple(cameras),
-        fps=fps,
-        timestamps=np.arange(len(mattes)) / fps,
-        images=images,
-        mattes=mattes,
-        landmarks=landmarks,
-        valid=valid,
+        name=name, camera_ids=tuple(cameras), fps=fps, timestamps=np.arange(len(mattes)) / fps, images=images,
+        mattes=mattes, landmarks=landmarks, valid=valid,
         principal_point=np.stack([camera.K[:2, 2].double().numpy() for camera in views]),
-        source={"file": path.name, **found_by},
-        calibration=views,
-    )
+        source={"file": path.name, **found_by}, calibration=views,
+    )  # fmt: skip
 
 
 def sequence_of(

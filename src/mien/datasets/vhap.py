@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mien.datasets.content import REMEDY, frames_of, inner, numbers, read_object, scalars, sniff, stacked_poses
+from mien.datasets.content import REMEDY, inner, numbers, read_frames, scalars, sniff, stacked_poses
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.disk.reading import is_plain_name
 from mien.errors import UserError
@@ -41,8 +41,6 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Group:
-    """The frames of one sequence."""
-
     name: str
     timesteps: tuple[int, ...]
     cameras: tuple[str, ...]
@@ -59,12 +57,12 @@ def _recognises(path: Path) -> str | None:
 def _groups(path: Path) -> list[_Group]:
     """The sequences of the folder, each with the frames of all its json files."""
     parts = [_WHOLE] if (path / _WHOLE).exists() else [name for name in _PARTS if (path / name).exists()]
-    training = frames_of(path / _TRAIN, read_object(path / _TRAIN)) if (path / _TRAIN).exists() else []
+    training = read_frames(path / _TRAIN) if (path / _TRAIN).exists() else []
     trained = {str(frame.get("file_path")) for frame in training}
     found: dict[str, dict[tuple[int, str], _Frame]] = {}
     for part in parts:
         file = path / part
-        for number, frame in enumerate(frames_of(file, read_object(file))):
+        for number, frame in enumerate(read_frames(file)):
             timestep, camera = _place(file, number, frame)
             name = _folder_of(path, file, frame)
             key = (timestep, camera)
@@ -83,7 +81,6 @@ def _place(file: Path, number: int, frame: dict[str, Any]) -> tuple[int, str]:
 
 
 def _folder_of(path: Path, file: Path, frame: dict[str, Any]) -> str:
-    """The name of the folder that a frame's files are in."""
     parts = Path(str(frame.get("flame_param_path"))).parts
     name = parts[1] if len(parts) > 2 and parts[0] == ".." else path.resolve().name
     if not is_plain_name(name):
@@ -195,12 +192,12 @@ def _pictures(group: _Group, root: Path) -> tuple[np.ndarray, np.ndarray]:
     return images, mattes
 
 
-def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
-    from mien.datasets.flame_poses import FRONT, camera_of, face_of_flame, in_front
+def _read(path: Path, face_model: "FaceModel | None" = None, *, tracked: bool = True) -> Iterator[ReadSequence]:
+    from mien.datasets.flame_poses import FRONT, camera_of, face_of_flame, in_front, needed_flame
     from mien.datasets.overlay import check_overlay
     from mien.datasets.sequences import filmed_sequence, tracked_sequence
 
-    groups = _groups(path)
+    model, groups = needed_flame(path, face_model, _VERSION) if tracked else None, _groups(path)
     # The files of a UNION are beside it.
     root = path if all(group.name == path.resolve().name for group in groups) else path.parent
     for group in groups:
@@ -230,16 +227,6 @@ def _sequences(path: Path, model: "FaceModel | None") -> Iterator[ReadSequence]:
         yield replace(sequence, own_split=_own_split(group) if (path / _TRAIN).exists() else None)
 
 
-def _read(path: Path, face_model: "FaceModel | None") -> Iterator[ReadSequence]:
-    from mien.datasets.flame_poses import needed_flame
-
-    return _sequences(path, needed_flame(path, face_model, _VERSION))
-
-
-def _read_pictures(path: Path) -> Iterator[ReadSequence]:
-    return _sequences(path, None)
-
-
 def _better(made: Any, cameras: Any, group: _Group) -> "TrackedSequence":
     """The sequence with cy counted from above or from below, whichever fits the pictures better."""
     from mien.datasets.overlay import measure_overlay
@@ -262,5 +249,5 @@ def _better(made: Any, cameras: Any, group: _Group) -> "TrackedSequence":
 
 VHAP = Dataset(
     "vhap", "an export of VHAP, or a UNION folder of GaussianAvatars, with flame_param", "sequences", _recognises,
-    _read, _survey, _read_pictures,
+    _read, _survey, partial(_read, tracked=False),
 )  # fmt: skip

@@ -107,10 +107,8 @@ def read_gaussian_avatars_folder(folder: Path, face_model: FaceModel | None = No
         "means": stacked(columns, ["x", "y", "z"], path),
         "quats": stacked(columns, [f"rot_{i}" for i in range(4)], path),
         "log_scales": stacked(columns, [f"scale_{i}" for i in range(3)], path),
-        "opacity_logits": stacked(columns, ["opacity"], path)[:, 0],
-        "sh_constant": sh[:, :1],
-        "sh_rest": sh[:, 1:],
-    }
+        "opacity_logits": stacked(columns, ["opacity"], path)[:, 0], "sh_constant": sh[:, :1], "sh_rest": sh[:, 1:],
+    }  # fmt: skip
     for name, array in state.items():
         if not is_moderate(array):
             raise UserError(f"{path}: {name} holds NaN or numbers beyond {MAX_NUMBER:g}; export it again")
@@ -173,7 +171,6 @@ def _binding(columns: dict[str, np.ndarray], path: Path, triangles: int) -> Int[
 
 
 def _face_model_of(folder: Path) -> FaceModel | None:
-    """The face model in the folder, or None."""
     if not (folder / _MODEL_FILES[0]).exists():
         return None
     for name in _MODEL_FILES:
@@ -187,7 +184,6 @@ def _face_model_of(folder: Path) -> FaceModel | None:
 
 
 def _refuse_links(path: Path) -> None:
-    """Check that a file of the folder is an ordinary file."""
     try:
         open_to_read(path).close()
     except FileNotFoundError:

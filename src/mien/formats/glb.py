@@ -80,8 +80,7 @@ def write_glb(
         about["animates"] = _ANIMATES
         scenes.append({"name": "gaussians", "nodes": [len(content["nodes"]) - 1]})
         used += [_SPLATS, EXTENSION]
-    generator = f"mien {avatar.about.mien}"
-    content["asset"] = {"version": "2.0", "generator": generator, "extras": {"mien": about}}
+    content["asset"] = {"version": "2.0", "generator": f"mien {avatar.about.mien}", "extras": {"mien": about}}
     content |= {"scene": 0, "scenes": scenes, "extensionsUsed": used}
     if not mesh_only:
         content["extensions"] = {EXTENSION: _avatar_extension(path, writer, avatar)}
@@ -206,11 +205,9 @@ def _mesh_content(
         "WEIGHTS_0": writer.accessor(weights[points], VERTICES),
     }
     primitive = {
-        "attributes": attributes,
-        "indices": writer.accessor(index.reshape(-1).astype("<u4"), INDICES),
-        "material": 0,
+        "attributes": attributes, "indices": writer.accessor(index.reshape(-1).astype("<u4"), INDICES), "material": 0,
         "targets": [{"POSITION": writer.sparse(moved[points])} for moved in targets.values()],
-    }
+    }  # fmt: skip
     mesh = {"name": "head", "primitives": [primitive], "extras": {"targetNames": list(targets)}}
     if targets:
         mesh["weights"] = [0.0] * len(targets)
@@ -244,10 +241,8 @@ def _skin(writer: GlbWriter, rig: Rig, face: Face, first_node: int) -> dict[str,
     inverse[:, 3, :3] = -positions  # column by column
     return {
         "inverseBindMatrices": writer.accessor(inverse.reshape(-1, 16)),
-        "joints": list(range(first_node, first_node + len(nodes))),
-        "skeleton": first_node,
-        "nodes": nodes,
-    }
+        "joints": list(range(first_node, first_node + len(nodes))), "skeleton": first_node, "nodes": nodes,
+    }  # fmt: skip
 
 
 def _add_texture(writer: GlbWriter, content: dict[str, Any], texture: Float32[np.ndarray, "s s 3"]) -> None:

@@ -102,16 +102,10 @@ def _head_part(avatar: runtime.Avatar, title: str, address: str | None, poster: 
     tags = [f'<link rel="icon" href="data:image/png;base64,{icon}">']
     if address:
         facts = {
-            "og:type": "website",
-            "og:title": title,
-            "og:description": "A living 3D head. Turn it, and make it smile.",
-            "og:url": address,
-            "og:image": urljoin(address, poster.name),
-            "og:image:width": str(POSTER[0]),
-            "og:image:height": str(POSTER[1]),
-            "og:image:alt": title,
-            "twitter:card": "summary_large_image",
-        }
+            "og:type": "website", "og:title": title, "og:description": "A living 3D head. Turn it, and make it smile.",
+            "og:url": address, "og:image": urljoin(address, poster.name), "og:image:width": str(POSTER[0]),
+            "og:image:height": str(POSTER[1]), "og:image:alt": title, "twitter:card": "summary_large_image",
+        }  # fmt: skip
         tags += [f'<meta property="{name}" content="{html.escape(text)}">' for name, text in facts.items()]
     return "".join(tags)
 

@@ -180,14 +180,10 @@ def _raw_columns(gaussians: "mien.gaussians.Gaussians", coefficients: int) -> Fl
     # Logits of exactly 0 and 1 are infinite. Logits of +-16.6 give 6e-8 and the float32 next to 1.
     opacities = gaussians.opacities.detach().double().clamp(6e-8, 1 - 6e-8)
     columns = (
-        gaussians.means.detach(),
-        torch.zeros_like(gaussians.means),
-        sh[:, 0],
-        sh[:, 1:].transpose(1, 2).flatten(1),
-        torch.logit(opacities)[:, None],
-        gaussians.scales.detach().double().log(),
+        gaussians.means.detach(), torch.zeros_like(gaussians.means), sh[:, 0], sh[:, 1:].transpose(1, 2).flatten(1),
+        torch.logit(opacities)[:, None], gaussians.scales.detach().double().log(),
         torch.nn.functional.normalize(gaussians.quats.detach(), dim=-1),
-    )
+    )  # fmt: skip
     return torch.cat([column.cpu().float() for column in columns], dim=1).numpy().astype("<f4", order="C", copy=False)
 
 
@@ -236,7 +232,6 @@ def _pose_of(path: Path, lines: list[str]) -> Float32[np.ndarray, "4 4"] | None:
 def _activated(
     columns: dict[str, np.ndarray], pose: Float32[np.ndarray, "4 4"] | None, path: Path
 ) -> "mien.gaussians.Gaussians":
-    """Gaussians from raw columns by name."""
     import torch
 
     from mien.gaussians import Gaussians
@@ -245,13 +240,10 @@ def _activated(
         return torch.from_numpy(stacked(columns, list(names), path))
 
     gaussians = Gaussians(
-        means=read("x", "y", "z"),
-        quats=read(*(f"rot_{i}" for i in range(4))),
-        scales=read(*(f"scale_{i}" for i in range(3))).exp(),
-        opacities=torch.sigmoid(read("opacity")[:, 0]),
-        sh=torch.from_numpy(stacked_sh(columns, path)),
-        T_world_local=None if pose is None else torch.from_numpy(pose),
-    )
+        means=read("x", "y", "z"), quats=read(*(f"rot_{i}" for i in range(4))),
+        scales=read(*(f"scale_{i}" for i in range(3))).exp(), opacities=torch.sigmoid(read("opacity")[:, 0]),
+        sh=torch.from_numpy(stacked_sh(columns, path)), T_world_local=None if pose is None else torch.from_numpy(pose),
+    )  # fmt: skip
     for word, name in _WORDS.items():
         if not getattr(gaussians, name).isfinite().all():
             raise UserError(f"{path}: the {word} of some Gaussians is NaN or infinite; export it again, or clean it up")

@@ -36,7 +36,7 @@ _OWN = (
     Format("ply", "pose", _of("ply:write"), (".ply",), options=_of("ply:PlyOptions")),
     Format("spz", "pose", _of("spz:write"), (".spz",), options=_of("spz:SpzOptions")),
     Format("sog", "pose", _of("sog:write"), (".sog",), options=SplatOptions),
-    Format("usd", "sequence", _of("usd:write"), _USD, check=_of("usd:check_usd_options")),
+    Format("usd", "sequence", _of("usd:write"), _USD, check=_of("usd:check_usd")),
     Format("gaussian-avatars", "folder", _of("gaussian_avatars:write"), options=NoOptions),
 )
 
@@ -67,8 +67,7 @@ def find_format(name: str) -> Format | None:
 
 def _first(fits: Callable[[Format], bool]) -> Format | None:
     """Return the first format that fits. Other packages are asked only if it is none of mien's own."""
-    own = next(filter(fits, _OWN), None)
-    return own or next(filter(fits, formats()), None)
+    return next(filter(fits, _OWN), None) or next(filter(fits, formats()), None)
 
 
 def numbered(path: Path, index: int) -> Path:

@@ -57,14 +57,11 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
         "sh0.webp": _picture(np.concatenate([color_codes, alpha[:, None]], axis=1), width),
     }
     meta: dict[str, Any] = {
-        "version": _VERSION,
-        "count": len(means),
-        "antialias": False,
+        "version": _VERSION, "count": len(means), "antialias": False,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scale_book, "files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
+        "scales": {"codebook": scale_book, "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_book, "files": ["sh0.webp"]},
-    }
+    }  # fmt: skip
     if sh.shape[1] > 1:
         meta["shN"] = _add_palette(pictures, sh[:, 1:], width)
     members = {"meta.json": json.dumps(meta, allow_nan=False).encode(), **pictures}
@@ -133,12 +130,9 @@ def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray
         palette = pixels("shN", 0, 3).reshape(-1, rest, 3)
         sh = np.concatenate([sh, book("shN")[palette[labels]]], axis=1)
     return (
-        np.sign(logged) * np.expm1(np.abs(logged)),
-        _unpacked_quats(pixels("quats", 0, 4)),
-        np.exp(book("scales", np.float64)[pixels("scales", 0, 3)]),
-        shades[:, 3] / 255,
-        sh,
-    )
+        np.sign(logged) * np.expm1(np.abs(logged)), _unpacked_quats(pixels("quats", 0, 4)),
+        np.exp(book("scales", np.float64)[pixels("scales", 0, 3)]), shades[:, 3] / 255, sh,
+    )  # fmt: skip
 
 
 def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
@@ -153,8 +147,7 @@ def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
         counts = np.diff(ends)
         book = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), book)
     book = np.sort(book.astype(np.float32))
-    codes = np.searchsorted((book[1:] + book[:-1]) / 2, values)
-    return codes.astype(np.uint8), book.tolist()
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8), book.tolist()
 
 
 def _add_palette(pictures: dict[str, bytes], higher: np.ndarray, width: int) -> dict[str, Any]:
@@ -202,8 +195,7 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     largest = np.abs(quats).argmax(1)
     signed = quats * np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1, 1)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    kept = np.take_along_axis(signed, others, 1)
-    codes = np.clip(np.round((kept / np.sqrt(2) + 0.5) * 255), 0, 255)
+    codes = np.clip(np.round((np.take_along_axis(signed, others, 1) / np.sqrt(2) + 0.5) * 255), 0, 255)
     return np.concatenate([codes, largest[:, None] + _MODE], axis=1).astype(np.uint8)
 
 

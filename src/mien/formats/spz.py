@@ -61,13 +61,11 @@ def write_spz(path: Path, gaussians: "mien.gaussians.Gaussians", version: Litera
         raise UserError(f"{path}: a Gaussian is {reach:.3g} m away, too far for .spz; write a .ply")
     fixed = np.round(means.astype(np.float64) * 2**fraction).astype("<i4")
     columns = (
-        fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
-        _bytes(opacities * 255),
+        fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3], _bytes(opacities * 255),
         _bytes((sh[:, 0] * _COLOR_SCALE + 0.5) * 255),
         _bytes((np.log(np.maximum(scales, 1e-30)) + _LOG_SCALE_OFFSET) * _LOG_SCALE_STEPS),
-        _packed_quats(unit_quats(quats)),
-        _bytes(sh[:, 1:] * _SH_STEPS + _SH_STEPS),
-    )
+        _packed_quats(unit_quats(quats)), _bytes(sh[:, 1:] * _SH_STEPS + _SH_STEPS),
+    )  # fmt: skip
     parts, facts = [column.tobytes() for column in columns], (len(means), math.isqrt(sh.shape[1]) - 1, fraction, 0)
     if version == 3:
         data = gzip.compress(_HEADER.pack(_MAGIC, version, *facts, 0) + b"".join(parts), mtime=0)
@@ -101,7 +99,6 @@ def read_spz(path: Path) -> "mien.gaussians.Gaussians":
 
 
 def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
-    """The file of version 4 with these columns."""
     import zstandard
 
     # A quarter of a second for 40,000 Gaussians, and 3 % smaller than by the default level.
@@ -113,7 +110,6 @@ def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
 
 
 def _shapes(count: int, degree: int, quat_bytes: int = 4) -> list[tuple[int, ...]]:
-    """The shapes of all columns."""
     if count > MAX_GAUSSIANS:
         raise ValueError(f"it has {count:,} Gaussians, and at most {MAX_GAUSSIANS:,} are read")
     return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, quat_bytes), (count, (degree + 1) ** 2 - 1, 3)]

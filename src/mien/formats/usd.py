@@ -27,14 +27,10 @@ _MAX_BYTES = 1 << 28
 _REMEDY = "give a USD file of `mien export`"
 
 
-def check_usd_options(path: Path, options: PoseOptions) -> None:
-    """Check the options, and that usd-core is installed."""
-    check_options(path, options)
-    check_usd(path)
-
-
-def check_usd(path: Path) -> None:
-    """Check that usd-core, which writes and reads `path`, is installed."""
+def check_usd(path: Path, options: PoseOptions | None = None) -> None:
+    """Check the options, if any, and that usd-core, which writes and reads `path`, is installed."""
+    if options is not None:
+        check_options(path, options)
     if importlib.util.find_spec("pxr") is None:
         raise UserError(f"{path}: needs the package usd-core, which is missing; run `pip install 'mien[usd]'`")
 
@@ -128,8 +124,7 @@ def _layer_alone(path: Path) -> Any:
     # USD ends the whole process where it uses a prim without a name.
     if any(place.isEmpty for place in places) or not all(found):
         raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
-    clips = any(prim.HasInfo("clips") for prim in found)
-    if clips or layer.GetCompositionAssetDependencies():
+    if any(prim.HasInfo("clips") for prim in found) or layer.GetCompositionAssetDependencies():
         raise UserError(f"{path}: refers to other files, which are not opened; flatten it into one file")
     return layer
 

@@ -19,16 +19,10 @@ from mien.runtime.named import GAZE_NAMES, LOOK_ANGLE, presets, visemes, within_
 EXTENSION, SPEC_VERSION = "VRMC_vrm", "1.0"
 LICENCE = "https://vrm.dev/licenses/1.0/"
 PERMISSIONS = {
-    "avatarPermission": "onlyAuthor",
-    "commercialUsage": "personalNonProfit",
-    "creditNotation": "required",
-    "modification": "prohibited",
-    "allowRedistribution": False,
-    "allowExcessivelyViolentUsage": False,
-    "allowExcessivelySexualUsage": False,
-    "allowPoliticalOrReligiousUsage": False,
-    "allowAntisocialOrHateUsage": False,
-}
+    "avatarPermission": "onlyAuthor", "commercialUsage": "personalNonProfit", "creditNotation": "required",
+    "modification": "prohibited", "allowRedistribution": False, "allowExcessivelyViolentUsage": False,
+    "allowExcessivelySexualUsage": False, "allowPoliticalOrReligiousUsage": False, "allowAntisocialOrHateUsage": False,
+}  # fmt: skip
 """Permissions of the file: the least that VRM can say, because the head is that of a living person."""
 BODY: dict[str, tuple[str | None, tuple[float, float, float]]] = {
     "hips": (None, (0, 0.92, 0)),

@@ -77,12 +77,9 @@ class CameraSwitch:
     """Follows a camera while it is on. Methods may be called from any thread."""
 
     def __init__(
-        self,
-        session: Session,
-        open_camera: Callable[[], "LiveCamera"],
-        make: Callable[[], "Follower"],
+        self, session: Session, open_camera: Callable[[], "LiveCamera"], make: Callable[[], "Follower"],
         clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Prepare to follow; nothing is opened before `start`. `clock` is the camera's, in seconds."""
         self._session, self._open, self._make, self._clock = session, open_camera, make, clock
         self._lock = threading.Lock()

@@ -109,8 +109,7 @@ def draw(
         image = render_mesh(vertices, faces, seen_by, colors, light=Headlight(), background=background)[0]
         picture = to_rgb(image.numpy())
     if look.wireframe:
-        index = rasterize_mesh(vertices, faces, seen_by).face_index.numpy()
-        picture = _with_edges(picture, index)
+        picture = _with_edges(picture, rasterize_mesh(vertices, faces, seen_by).face_index.numpy())
     return picture
 
 

@@ -49,11 +49,9 @@ def matches(text: str, name: str) -> bool:
 
 
 def random_expression(
-    names: Sequence[str],
-    rest: Float32[np.ndarray, " e"],
-    bounds: Float32[np.ndarray, "e 2"],
+    names: Sequence[str], rest: Float32[np.ndarray, " e"], bounds: Float32[np.ndarray, "e 2"],
     random: np.random.Generator,
-) -> Float32[np.ndarray, " e"]:
+) -> Float32[np.ndarray, " e"]:  # fmt: skip
     """The coefficients of a random face: a few expressions beyond the person at rest, the same on both sides.
 
     Jaw and mouth go to one side only, and eyes stay open.

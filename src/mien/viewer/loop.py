@@ -38,12 +38,9 @@ class DrawingLoop:
     """Draws one picture at a time, for the client that has waited longest."""
 
     def __init__(
-        self,
-        draw: Callable[[View, bool], Any],
-        advance: Callable[[float], float | None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        failed: Callable[[Exception], None] = lambda error: None,
-    ) -> None:
+        self, draw: Callable[[View, bool], Any], advance: Callable[[float], float | None] | None = None,
+        clock: Callable[[], float] = time.monotonic, failed: Callable[[Exception], None] = lambda error: None,
+    ) -> None:  # fmt: skip
         """Make a loop that is not running yet.
 
         `draw` returns the picture of a view, of half size or full size. `advance` is called before each picture with
@@ -109,7 +106,6 @@ class DrawingLoop:
         return 0.0
 
     def _serve(self, key: int, client: _Client, view: View, wanted: int, full: bool) -> None:
-        """Draw and show a picture for a client."""
         began = self._clock()
         picture = self._draw(view, full)
         ended = self._clock()

@@ -29,14 +29,9 @@ class Panel:
     """The controls of one session."""
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        session: Session,
-        title: str,
-        view_of: Callable[..., View],
-        failed: Callable[[Exception], None],
-        camera: CameraSwitch | None = None,
-    ) -> None:
+        self, server: viser.ViserServer, session: Session, title: str, view_of: Callable[..., View],
+        failed: Callable[[Exception], None], camera: CameraSwitch | None = None,
+    ) -> None:  # fmt: skip
         """Add the controls to a server.
 
         `title` names the avatar, for people and for the files that are saved; `view_of` returns the view of a client's
@@ -108,7 +103,6 @@ class Panel:
             self.play_button.label, self.play_button.disabled = label, self._loading
 
     def _name_preset(self) -> None:
-        """Let the preset be the one that is shown."""
         shown = _NOTHING if self._session.preset is None else readable(self._session.preset)
         if self.preset is not None and self.preset.value != shown:
             self.preset.value = shown
@@ -327,13 +321,10 @@ class Panel:
                 self._complain(client, "A video is being written; wait for it.")
 
     def _photograph(self, client: viser.ClientHandle) -> None:
-        """Draw a screenshot and send it."""
         content = screenshot(self._session, self._view_of(client.camera))
         client.send_file_download(f"{self._title}.png", content, save_immediately=True)
 
     def _record(self, client: viser.ClientHandle) -> None:
-        """Write a video and send it."""
-
         def go_on() -> bool:
             return not self._stopping and client.client_id in self._server.get_clients()
 
@@ -366,7 +357,6 @@ def filmed_from(session: Session) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _rounded(value: float, low: float, high: float) -> float:
-    """The value as a slider shows it."""
     return min(max(round(value / _STEP) * _STEP, low), high)
 
 

@@ -228,12 +228,9 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
     start = module.serve
 
     def guarded(
-        handler: Callable[[Any], Awaitable[None]],
-        host: str,
-        port: int,
-        process_request: Callable[[Any, Request], Response | None],
-        **named: Any,
-    ) -> Any:
+        handler: Callable[[Any], Awaitable[None]], host: str, port: int,
+        process_request: Callable[[Any, Request], Response | None], **named: Any,
+    ) -> Any:  # fmt: skip
         def process(connection: Any, request: Request) -> Response | None:
             response = door.answer(request.path, dict(request.headers.raw_items()))
             if response is None:

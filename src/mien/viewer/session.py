@@ -16,19 +16,7 @@ from mien import runtime
 from mien.errors import UserError
 from mien.runtime.filmed import within_filmed_inputs
 from mien.runtime.posing import Face
-from mien.viewer.drawing import (
-    BACKGROUNDS,
-    MAX_SIDE,
-    Look,
-    Mesh,
-    Surface,
-    View,
-    beside,
-    draw,
-    in_corner,
-    shrunk,
-    words_about_view,
-)
+from mien.viewer import drawing
 from mien.viewer.faces import random_expression
 
 if TYPE_CHECKING:
@@ -60,8 +48,9 @@ class Session:
     """An avatar with its face, its motion, and what is drawn of it."""
 
     def __init__(
-        self, avatar: runtime.Avatar, mesh: Mesh | None = None, clips: Mapping[str, Callable[[], Clip]] | None = None
-    ) -> None:
+        self, avatar: runtime.Avatar, mesh: drawing.Mesh | None = None,
+        clips: Mapping[str, Callable[[], Clip]] | None = None,
+    ) -> None:  # fmt: skip
         """Show an avatar at rest. Each of the motions, which have names, is loaded at its first use."""
         self.avatar, self.mesh = avatar, mesh
         self._makers, self._clips = dict(clips or {}), dict[str, Clip]()
@@ -83,7 +72,7 @@ class Session:
         self._seen: Seen | None = None
         self._drawn: Seen | None = None
         self._last_seen: Seen | None = None
-        self.look, self.height, self.side_by_side = Look(), DEFAULT_HEIGHT, False
+        self.look, self.height, self.side_by_side = drawing.Look(), DEFAULT_HEIGHT, False
         self.with_camera = True
         """Whether pictures show in a corner what the camera saw."""
         self.changed: Callable[[], None] = lambda: None
@@ -217,7 +206,7 @@ class Session:
             self.changed()
 
     def picture(
-        self, view: View, full: bool = True, height: int | None = None, timestep: int | None = None
+        self, view: drawing.View, full: bool = True, height: int | None = None, timestep: int | None = None
     ) -> UInt8[np.ndarray, "h w 3"]:
         """The picture of a view, of full size or half of it.
 
@@ -242,16 +231,16 @@ class Session:
                 source = self.avatar.camera.width, self.avatar.camera.height
             else:
                 source, wide = (frame.shape[1], frame.shape[0]), max(1, wide // 2)
-            camera = view.camera(wide, high, shrunk(*source, wide, high))
-            shown = draw(self._gaussians(face), face, self.mesh, look, camera)
-            picture = shown if frame is None else beside(frame, shown, look.background)
+            camera = view.camera(wide, high, drawing.shrunk(*source, wide, high))
+            shown = drawing.draw(self._gaussians(face), face, self.mesh, look, camera)
+            picture = shown if frame is None else drawing.beside(frame, shown, look.background)
             if seen is not self._last_seen:
                 self._drawn = self._last_seen = seen
-            return in_corner(seen.picture, picture) if seen is not None and self.with_camera else picture
+            return drawing.in_corner(seen.picture, picture) if seen is not None and self.with_camera else picture
 
-    def words(self, view: View) -> str:
+    def words(self, view: drawing.View) -> str:
         """One line about whether a view shows a side that was filmed."""
-        return words_about_view(self.avatar.portable.filmed, self.face, view)
+        return drawing.words_about_view(self.avatar.portable.filmed, self.face, view)
 
     def _gaussians(self, face: Face) -> runtime.Gaussians:
         """The Gaussians of a face. The last ones are kept, because several views show the same face."""
@@ -283,18 +272,17 @@ def _check_finite(name: str, value: float) -> None:
 
 
 def _check_look(changes: Mapping[str, Any]) -> None:
-    for name, known in (("surface", get_args(Surface)), ("background", tuple(BACKGROUNDS))):
+    for name, known in (("surface", get_args(drawing.Surface)), ("background", tuple(drawing.BACKGROUNDS))):
         if name in changes and changes[name] not in known:
             raise UserError(f"{name} {changes[name]!r}: there is none; give one of {', '.join(known)}")
-    if not 1 <= changes.get("height", DEFAULT_HEIGHT) <= MAX_SIDE:
-        raise UserError(f"height {changes['height']}: give 1 to {MAX_SIDE} pixels")
+    if not 1 <= changes.get("height", DEFAULT_HEIGHT) <= drawing.MAX_SIDE:
+        raise UserError(f"height {changes['height']}: give 1 to {drawing.MAX_SIDE} pixels")
 
 
 def center_of(avatar: runtime.Avatar) -> Float32[np.ndarray, " 3"]:
     """The middle of the avatar at rest in world space, in metres: of the box that holds nearly all of its Gaussians."""
     posed = avatar.pose()
-    box = np.quantile(posed.means, (0.02, 0.98), axis=0)
-    middle = box.mean(0)
+    middle = np.quantile(posed.means, (0.02, 0.98), axis=0).mean(0)
     if posed.T_world_local is not None:
         middle = posed.T_world_local[:3, :3] @ middle + posed.T_world_local[:3, 3]
     return middle.astype(np.float32)

@@ -73,8 +73,7 @@ def consensus(boxes: Float[np.ndarray, "t c 4"], cameras: Sequence[Camera]) -> H
         best[better], best_cost[better] = points[better], cost[better]
     agrees = _misses(best, centers, sides, cameras) < _HEAD_MOST_MISS
     agrees[agrees.sum(axis=1) < 2] = False
-    refined = triangulate(centers[:, :, None], agrees, cameras)[:, 0]
-    return HeadPath(refined, agrees)
+    return HeadPath(triangulate(centers[:, :, None], agrees, cameras)[:, 0], agrees)
 
 
 def triangulate(
@@ -175,11 +174,9 @@ def _nearest_point(
 
 
 def _misses(
-    points: Float[np.ndarray, "t 3"],
-    centers: Float[np.ndarray, "t c 2"],
-    sides: Float[np.ndarray, "t c"],
+    points: Float[np.ndarray, "t 3"], centers: Float[np.ndarray, "t c 2"], sides: Float[np.ndarray, "t c"],
     cameras: Sequence[Camera],
-) -> Float[np.ndarray, "t c"]:
+) -> Float[np.ndarray, "t c"]:  # fmt: skip
     projected = np.stack([project(points, camera) for camera in cameras], axis=1)
     with np.errstate(invalid="ignore"):
         misses = np.linalg.norm(projected - centers, axis=-1) / sides

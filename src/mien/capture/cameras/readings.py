@@ -164,8 +164,7 @@ class Ranked:
 
 def rank_readings(landmarks: Float[np.ndarray, "t c l 2"], readings: Sequence[Reading]) -> list[Ranked]:
     """Rank the readings, best first, by landmarks in pixels of their cameras (NaN where there is no face)."""
-    seen = np.isfinite(landmarks[..., 0, 0]).sum(axis=1)
-    several = np.flatnonzero(seen >= 2)
+    several = np.flatnonzero(np.isfinite(landmarks[..., 0, 0]).sum(axis=1) >= 2)
     chosen = several[:: -(-len(several) // 24) or 1]
     landmarks = landmarks[chosen].astype(np.float64)
     boxes = np.concatenate([landmarks.min(axis=2), landmarks.max(axis=2)], axis=-1)

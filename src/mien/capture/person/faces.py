@@ -136,6 +136,5 @@ class LandmarkDetector(MeshReader):
 
 def second_difference_jitter(landmarks: Float[np.ndarray, "t l 2"]) -> float:
     """Return the median length in pixels of the landmarks' second difference; NaN for fewer than three frames."""
-    differences = landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]
-    lengths = np.linalg.norm(differences, axis=-1)
+    lengths = np.linalg.norm(landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2], axis=-1)
     return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else float("nan")

@@ -29,12 +29,8 @@ class GivenMattes:
     """Mattes of a source's frames, read once and in order."""
 
     def __init__(
-        self,
-        path: Path,
-        picture_size: tuple[int, int],
-        lens: Lens | None = None,
-        own: FrameSource | None = None,
-    ) -> None:
+        self, path: Path, picture_size: tuple[int, int], lens: Lens | None = None, own: FrameSource | None = None,
+    ) -> None:  # fmt: skip
         """Prepare to read a video or a folder. `own` is the source itself, if its alpha is the matte."""
         self._path, self._lens = path, lens
         self._size, self._is_own = picture_size, own is not None
@@ -181,8 +177,7 @@ def _read_csv(path: Path, most: int) -> np.ndarray:
                 continue
             if len(line) not in (0, 2 * LANDMARKS):
                 raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
-            numbers = [_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)
-            rows.append(np.array(numbers))
+            rows.append(np.array([_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)))
             if len(rows) > most:
                 break
     except (OSError, ValueError, csv.Error) as error:

@@ -121,14 +121,12 @@ class BoxNetwork:
         # Row 0 is the middle, row 1 the size, and rows 2 and 3 are the eyes; positions count from the guess's cell.
         points[:, [0, 2, 3]] += self._cells[sure][:, None]
         corners = np.stack([points[:, 0] - points[:, 1] / 2, points[:, 0] + points[:, 1] / 2], axis=1)
-        guesses = (np.concatenate([corners, points[:, 2:4]], axis=1) - 0.5) * extent + center
-        return _merge(guesses, scores[sure])
+        return _merge((np.concatenate([corners, points[:, 2:4]], axis=1) - 0.5) * extent + center, scores[sure])
 
 
 def _centers(cells: int, guesses: int) -> Float[np.ndarray, "n 2"]:
     along = (np.arange(cells) + 0.5) / cells
-    grid = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-    return np.repeat(grid, guesses, axis=0)
+    return np.repeat(np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2), guesses, axis=0)
 
 
 def _merge(guesses: Float[np.ndarray, "n 4 2"], scores: Float[np.ndarray, " n"]) -> Faces:
@@ -190,8 +188,7 @@ class Mesh:
 
     def _read(self, image: np.ndarray, square: _Square) -> Float[np.ndarray, "478 3"] | None:
         side = self._network.side
-        seen = cut_out(image, *square, side)
-        points, presence = self._network.run(seen.astype(np.float32) / 255)[:2]
+        points, presence = self._network.run(cut_out(image, *square, side).astype(np.float32) / 255)[:2]
         if 1 / (1 + np.exp(-float(presence.ravel()[0]))) < 0.5:
             return None
         points = points.reshape(-1, 3).astype(float) / side

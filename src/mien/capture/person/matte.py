@@ -92,11 +92,9 @@ def guided_filter(
     height, width = values.shape
     half = (max(1, width // 2), max(1, height // 2))
     slope, offset = _affine_fit(
-        cv2.resize(guide, half, interpolation=cv2.INTER_AREA),
-        cv2.resize(values, half, interpolation=cv2.INTER_AREA),
-        max(1, radius // 2),
-        epsilon,
-    )
+        cv2.resize(guide, half, interpolation=cv2.INTER_AREA), cv2.resize(values, half, interpolation=cv2.INTER_AREA),
+        max(1, radius // 2), epsilon,
+    )  # fmt: skip
     slope = cv2.resize(slope, (width, height), interpolation=cv2.INTER_LINEAR)
     offset = cv2.resize(offset, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.einsum("hwc,hwc->hw", slope, guide) + offset
@@ -139,12 +137,9 @@ PrepareMatte = Callable[[int, UInt8[np.ndarray, "h w 3"]], MakeMatte]
 
 
 def choose_matting(
-    stack: ExitStack,
-    crop: Crop,
-    plate: UInt8[np.ndarray, "h w 3"] | None,
-    mattes: GivenMattes | None,
+    stack: ExitStack, crop: Crop, plate: UInt8[np.ndarray, "h w 3"] | None, mattes: GivenMattes | None,
     detector: DetectorChoice = "auto",
-) -> PrepareMatte:
+) -> PrepareMatte:  # fmt: skip
     """Return the matting that the user's inputs allow. `stack` closes whatever is opened."""
     if mattes is not None:
 

@@ -70,8 +70,7 @@ def choose_person(survey: Survey) -> Person:
     people = [
         _gather(track, lasting, areas, survey.colors) for track in lasting[:8]
     ]  # those that fill the picture most
-    accepted = max(people, key=lambda tracks: _weight(tracks, areas))
-    for track in accepted:
+    for track in max(people, key=lambda tracks: _weight(tracks, areas)):
         for frame, place in track:
             boxes[frame] = survey.boxes[frame, place]
             others[frame, place] = np.nan
@@ -114,8 +113,7 @@ def _distance(before: Float[np.ndarray, " 4"], now: Float[np.ndarray, " 4"]) -> 
     size_before, size_now = (max(math.sqrt(max((b[2] - b[0]) * (b[3] - b[1]), 0)), 1e-6) for b in (before, now))
     if not 1 / _PERSON_MOST_GROWTH <= size_now / size_before <= _PERSON_MOST_GROWTH:
         return float("inf")
-    centers = (before[:2] + before[2:] - now[:2] - now[2:]) / 2
-    return float(np.abs(centers).max()) / max(size_before, size_now)
+    return float(np.abs((before[:2] + before[2:] - now[:2] - now[2:]) / 2).max()) / max(size_before, size_now)
 
 
 def _weight(tracks: list[_Track], areas: Float[np.ndarray, "t f"]) -> float:

@@ -95,8 +95,7 @@ def _shift(picture: np.ndarray, scene: np.ndarray, background: np.ndarray) -> Fl
         gray = cv2.resize(image.mean(axis=-1), size, interpolation=cv2.INTER_AREA)
         gray = gray - cv2.GaussianBlur(gray, (0, 0), 4.0)
         prepared.append((gray * known).astype(np.float32))
-    window = cv2.createHanningWindow(size, cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(prepared[0], prepared[1], window)
+    (x, y), _ = cv2.phaseCorrelate(prepared[0], prepared[1], cv2.createHanningWindow(size, cv2.CV_32F))
     if max(abs(x), abs(y)) > _PLATE_MOST_SHIFT:
         return np.zeros(2)
     return np.array([x * width / size[0], y * height / size[1]])

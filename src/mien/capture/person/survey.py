@@ -75,11 +75,9 @@ class Survey:
 
 
 def survey_source(
-    frames: FrameSource,
-    work: Path,
-    landmarks: Float[np.ndarray, "n l 2"] | None = None,
+    frames: FrameSource, work: Path, landmarks: Float[np.ndarray, "n l 2"] | None = None,
     detector: DetectorChoice = "auto",
-) -> Survey:
+) -> Survey:  # fmt: skip
     """Survey all frames. Results that an earlier call left in the folder `work` are kept.
 
     If landmarks are given for every frame of the source, in pixels and NaN for no face, faces are not searched.

@@ -88,8 +88,7 @@ class Filmed:
 
     def face(self) -> FaceParams:
         """Return the faces at all written timesteps, seen by `flame_poses.FRONT` in place of the first camera."""
-        face = self.sequence.tracking.face[self.timesteps]
-        return in_front(face, self.camera.viewmat.double().numpy())
+        return in_front(self.sequence.tracking.face[self.timesteps], self.camera.viewmat.double().numpy())
 
     def head_to_camera(self) -> Float[np.ndarray, "t 4 4"]:
         """Return the head frame's pose at each written timestep in the first camera's OpenCV axes, in metres."""

@@ -86,10 +86,8 @@ class GlbWriter:
     def _described(array: np.ndarray, bounds: bool) -> dict[str, Any]:
         width = int(np.prod(array.shape[1:], dtype=int))
         described: dict[str, Any] = {
-            "componentType": _COMPONENTS[array.dtype],
-            "count": len(array),
-            "type": _TYPES[width],
-        }
+            "componentType": _COMPONENTS[array.dtype], "count": len(array), "type": _TYPES[width],
+        }  # fmt: skip
         if bounds:
             flat = array.reshape(len(array), width)
             described |= {"min": flat.min(0).tolist(), "max": flat.max(0).tolist()}
@@ -107,12 +105,9 @@ class GlbWriter:
         text += b" " * (-len(text) % 4)
         size = 12 + 8 + len(text) + 8 + self._size
         parts = [
-            struct.pack("<III", _MAGIC, _VERSION, size),
-            struct.pack("<II", len(text), _JSON),
-            text,
-            struct.pack("<II", self._size, _BINARY),
-            *self._pieces,
-        ]
+            struct.pack("<III", _MAGIC, _VERSION, size), struct.pack("<II", len(text), _JSON), text,
+            struct.pack("<II", self._size, _BINARY), *self._pieces,
+        ]  # fmt: skip
         write_atomically(path, lambda temporary: temporary.write_bytes(b"".join(parts)))
 
 

@@ -57,8 +57,6 @@ class Motion:
 
 @dataclass(frozen=True)
 class _Code:
-    """How an array is stored."""
-
     bits: Literal[8, 16]
     axis: Literal["first", "columns"]
     signed: bool = False
@@ -71,31 +69,25 @@ _CODES = {
     "avatar.baked.means": _Code(16, "columns", levels=2047),
     "avatar.baked.attributes.quats": _Code(8, "columns", signed=True, levels=63),
     "avatar.baked.attributes.log_scales": _Code(8, "columns"),
-    "avatar.baked.attributes.opacity_logits": _Code(8, "columns"),
-    "avatar.baked.attributes.sh": _Code(8, "columns"),
+    "avatar.baked.attributes.opacity_logits": _Code(8, "columns"), "avatar.baked.attributes.sh": _Code(8, "columns"),
     "avatar.baked.changes.color": _Code(8, "columns", signed=True),
     "avatar.baked.changes.opacity_logits": _Code(8, "columns", signed=True),
     "avatar.baked.changes.means": _Code(8, "columns", signed=True, levels=63),
-    "avatar.baked.changes.shares": _Code(8, "columns"),
-    "avatar.baked.changes.features.neutral": _Code(8, "columns"),
+    "avatar.baked.changes.shares": _Code(8, "columns"), "avatar.baked.changes.features.neutral": _Code(8, "columns"),
     "avatar.baked.changes.features.basis": _Code(8, "columns", signed=True, levels=31),
     "avatar.baked.changes.features.own": _Code(8, "columns"),
     "avatar.baked.bases.means": _Code(16, "first", signed=True),
     "avatar.baked.bases.log_scales": _Code(8, "columns", signed=True),
     "avatar.baked.bases.opacity_logits": _Code(8, "columns", signed=True),
-    "avatar.baked.bases.sh": _Code(8, "columns", signed=True),
-    "avatar.baked.network.base": _Code(16, "columns"),
+    "avatar.baked.bases.sh": _Code(8, "columns", signed=True), "avatar.baked.network.base": _Code(16, "columns"),
     "avatar.baked.network.along.basis": _Code(8, "columns", signed=True),
-    "avatar.baked.still_weights": _Code(16, "columns", signed=True),
-    "avatar.baked.rig.template": _Code(16, "columns"),
+    "avatar.baked.still_weights": _Code(16, "columns", signed=True), "avatar.baked.rig.template": _Code(16, "columns"),
     "avatar.baked.rig.expression_basis": _Code(16, "first", signed=True, levels=1023),
     "avatar.baked.rig.pose_basis": _Code(8, "first", signed=True),
-    "avatar.baked.rig.skinning_weights": _Code(16, "columns", signed=True),
-    "motion.expression": _Code(16, "columns"),
-    "motion.joints": _Code(16, "columns"),
-    "motion.head_rotation": _Code(16, "columns"),
+    "avatar.baked.rig.skinning_weights": _Code(16, "columns", signed=True), "motion.expression": _Code(16, "columns"),
+    "motion.joints": _Code(16, "columns"), "motion.head_rotation": _Code(16, "columns"),
     "motion.head_translation": _Code(16, "columns"),
-}
+}  # fmt: skip
 """Arrays that are not named here are stored as they are; all of them are small."""
 _BLOCKS = 6
 """zlib's memLevel, which decides how much of an array shares one Huffman code. 8, the default, makes packed avatars 2 %

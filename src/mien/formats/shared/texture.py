@@ -94,12 +94,8 @@ def _cameras(shot: Shot) -> list[Camera]:
 
 
 def _seen(
-    points: Float[Tensor, "p 3"],
-    normals: Float[Tensor, "p 3"],
-    surface: Surface,
-    shot: Shot,
-    camera: Camera,
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 1"]]:
+    points: Float[Tensor, "p 3"], normals: Float[Tensor, "p 3"], surface: Surface, shot: Shot, camera: Camera,
+) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p 1"]]:  # fmt: skip
     """The colours of points in one picture, and their weights."""
     plain = runtime.Camera(camera.K.numpy(), camera.viewmat.numpy(), camera.width, camera.height)
     image, alpha = map(torch.from_numpy, runtime.render(shot.gaussians, plain, (0.0, 0.0, 0.0)))

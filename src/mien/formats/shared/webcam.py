@@ -85,7 +85,6 @@ def _content(path: Path) -> bytes:
 
 
 def _package() -> dict[str, bytes]:
-    """The contents of the package's files."""
     named = os.environ.get(PACKAGE_VARIABLE)
     folder, contents = Path(named) if named else OWN, {}
     remedy = (

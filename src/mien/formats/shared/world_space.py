@@ -32,12 +32,9 @@ def with_y_down(gaussians: Gaussians) -> Gaussians:
     directions, count = _spread_directions()[1:2].to(gaussians.sh), gaussians.sh.shape[-2]
     signs = spherical_harmonics_basis(directions * turned, count) / spherical_harmonics_basis(directions, count)
     return Gaussians(
-        gaussians.means * turned,
-        torch.stack([-x, w, -z, y], dim=-1),
-        gaussians.scales,
-        gaussians.opacities,
+        gaussians.means * turned, torch.stack([-x, w, -z, y], dim=-1), gaussians.scales, gaussians.opacities,
         gaussians.sh * signs.sign().T,
-    )
+    )  # fmt: skip
 
 
 def rotate_sh(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
-from mien.camera import Box
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.metrics import crop_to, psnr
@@ -54,16 +53,11 @@ def growth(context: Context) -> Result:
     grown, slower = peak / max(start, 1), many / max(few, 1e-9)
     memory, gpu = context.summary["peak_memory_mb"], context.summary.get("gpu_memory_mb")
     values = {
-        "gaussians_start": int(start),
-        "gaussians_peak": int(peak),
-        "gaussians_growth": round(grown, 3),
-        "step_ms_start": round(few, 3),
-        "step_ms_peak": round(many, 3),
-        "step_time_growth": round(slower, 3),
-        "training_peak_memory_mb": memory,
-        "training_gpu_memory_mb": gpu,
+        "gaussians_start": int(start), "gaussians_peak": int(peak), "gaussians_growth": round(grown, 3),
+        "step_ms_start": round(few, 3), "step_ms_peak": round(many, 3), "step_time_growth": round(slower, 3),
+        "training_peak_memory_mb": memory, "training_gpu_memory_mb": gpu,
         "paper": {"gaussians_start": _PAPER_START, "gaussians_end": _PAPER_END, "step_time_growth_at_most": 2.0},
-    }
+    }  # fmt: skip
     rows = (
         ("Gaussians at the start", int(start), _PAPER_START),
         ("Gaussians, most", int(peak), _PAPER_END),
@@ -286,8 +280,7 @@ def jaw_opening(face: FaceParams, model: FaceModel) -> Float[Tensor, " b"]:
 
 
 def _jaw_expression(model: FaceModel) -> int:
-    jaw = model.joint_names.index("jaw")
-    return int(model.joint_rotation_basis[:, jaw].norm(dim=-1).argmax())
+    return int(model.joint_rotation_basis[:, model.joint_names.index("jaw")].norm(dim=-1).argmax())
 
 
 def _most_open(experiment: Experiment) -> list[Frame]:
@@ -295,8 +288,7 @@ def _most_open(experiment: Experiment) -> list[Frame]:
     model = experiment.avatar.face_model
     by_time = {(frame.sequence, frame.timestep): frame for frame in reversed(experiment.held_out_frames)}
     openings = {key: float(jaw_opening(experiment.face(frame), model)[0]) for key, frame in by_time.items()}
-    widest = sorted(openings, key=lambda key: (-openings[key], key))[:12]
-    return [by_time[key] for key in widest]
+    return [by_time[key] for key in sorted(openings, key=lambda key: (-openings[key], key))[:12]]
 
 
 @torch.no_grad()
@@ -307,24 +299,20 @@ def _image(experiment: Experiment, frame: Frame, kept: Bool[Tensor, " n"] | None
     return rasterize(gaussians, experiment.camera(frame), torch.ones(3)).image.clamp(0, 1)
 
 
-def _box_of(experiment: Experiment, frame: Frame, model: FaceModel) -> Box:
-    return mouth_box(model, experiment.face(frame), experiment.camera(frame))
-
-
 def _mouth_psnr(
     experiment: Experiment, frames: Sequence[Frame], model: FaceModel, kept: Bool[Tensor, " n"] | None = None
 ) -> float:
     """The mean PSNR of the mouth, whose place is that of `model`: one without teeth would have another box."""
-    values = [
-        psnr(_image(experiment, frame, kept), target_image(experiment, frame), _box_of(experiment, frame, model))
-        for frame in frames
-    ]
+    values = []
+    for frame in frames:
+        box = mouth_box(model, experiment.face(frame), experiment.camera(frame))
+        values.append(psnr(_image(experiment, frame, kept), target_image(experiment, frame), box))
     return round(sum(values) / len(values), 3)
 
 
 def _beside_truth(experiment: Experiment, frame: Frame, kept: Bool[Tensor, " n"], index: int) -> Picture:
     images = (target_image(experiment, frame), _image(experiment, frame, None), _image(experiment, frame, kept))
-    box = _box_of(experiment, frame, experiment.avatar.face_model)
+    box = mouth_box(experiment.avatar.face_model, experiment.face(frame), experiment.camera(frame))
     cut = [crop_to(image, box) for image in images]
     # At the size of the other pictures, without smoothing.
     rows, columns = (torch.arange(_SIDE) * size // _SIDE for size in cut[0].shape[:2])

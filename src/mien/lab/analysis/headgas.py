@@ -21,20 +21,7 @@ from mien.evaluation.metrics import crop_to
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians, world_means
-from mien.lab.analysis.measuring import (
-    draw_avatar,
-    draw_mesh,
-    head_camera,
-    held_out_scores,
-    labeled,
-    measure_drawing,
-    measured_on,
-    mouth_box,
-    mouth_camera,
-    perceptual_metric,
-    picture_of_runs,
-    score_cells,
-)
+from mien.lab.analysis import measuring
 from mien.lab.analysis.result import Chart, Film, Picture, Result, Table
 from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
@@ -111,25 +98,27 @@ def busy_face(context: Context) -> FaceParams:
 
 
 def _avatar_and_mesh(context: Context, face: FaceParams, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    return draw_avatar(context.avatar, face, camera), draw_mesh(context.avatar.face_model, face, camera)
+    return measuring.draw_avatar(context.avatar, face, camera), measuring.draw_mesh(
+        context.avatar.face_model, face, camera
+    )
 
 
 def basis(context: Context) -> Result:
     """The avatar with each expression alone, and the mesh with the same expression: Fig. 1."""
     assert isinstance(avatar := context.avatar, HeadGas)
     model, (start, added) = avatar.face_model, start_of_bases(avatar.subject, avatar.face_model)
-    camera = head_camera(model, start, context.camera, SIDE)
+    camera = measuring.head_camera(model, start, context.camera, SIDE)
 
     def alone(index: int, value: float) -> FaceParams:
         return with_expression(start, index, float(start.expression[0, index]) * added + value)
 
     names, highest = model.expression_names, trained_range(context).highest
-    first, mesh = draw_avatar(avatar, start, camera).astype(np.float32), model(start)[0]
+    first, mesh = measuring.draw_avatar(avatar, start, camera).astype(np.float32), model(start)[0]
     rows = []
     for index in track_progress(range(len(names)), "basis", len(names)):
         value = float(model.expression_bounds[index, 1].clamp(0, 1))
         face = alone(index, value)
-        change = float(np.abs(draw_avatar(avatar, face, camera) - first).mean())
+        change = float(np.abs(measuring.draw_avatar(avatar, face, camera) - first).mean())
         moved = 1e3 * float((model(face)[0] - mesh).norm(dim=-1).max())
         rows.append((names[index], round(value, 3), round(float(highest[index]), 3), round(change, 3), round(moved, 2)))
     # What training reached farthest, as a share of what is drawn, comes first.
@@ -138,7 +127,7 @@ def basis(context: Context) -> Result:
 
     def pair(index: int, value: float, digits: str) -> np.ndarray:
         drawn = _avatar_and_mesh(context, alone(index, value), camera)
-        return labeled(side_by_side(drawn[::-1]), f"{names[index]} {value:{digits}}")
+        return measuring.labeled(side_by_side(drawn[::-1]), f"{names[index]} {value:{digits}}")
 
     def film() -> Iterator[np.ndarray]:
         for index, frame in product(shown, range(16)):
@@ -148,12 +137,9 @@ def basis(context: Context) -> Result:
     write_video(context.folder / "basis.mp4", film(), _FPS)
     seen = sum(row[2] >= 0.5 * row[1] for row in rows if row[1] > 0)
     columns = {
-        "name": "Expression",
-        "value": "Drawn at",
-        "largest_in_training": "Largest in training",
-        "picture_change": "Change of the picture, of 255",
-        "mesh_moves_mm": "Mesh moves at most, mm",
-    }
+        "name": "Expression", "value": "Drawn at", "largest_in_training": "Largest in training",
+        "picture_change": "Change of the picture, of 255", "mesh_moves_mm": "Mesh moves at most, mm",
+    }  # fmt: skip
     base = "added to the person at rest" if added else "alone"
     caption = f"The 12 expressions that training reached farthest, each {base}: the mesh, and the avatar."
     grid = picture_grid([pair(index, rows[index][1], "g") for index in shown], 3)
@@ -193,26 +179,28 @@ def layers(context: Context) -> Result:
     shut, told, truth = _shut_frame(context)
     face, filming = (subject, context.camera) if shut is None else shut
     views = {
-        "head": (subject, head_camera(model, subject, context.camera, SIDE)),
-        "mouth": (face, mouth_camera(model, face, filming, SIDE)),
+        "head": (subject, measuring.head_camera(model, subject, context.camera, SIDE)),
+        "mouth": (face, measuring.mouth_camera(model, face, filming, SIDE)),
     }
     with torch.no_grad():
         posed = {name: avatar.pose(one).gaussians.timestep(0) for name, (one, _) in views.items()}
     orders, gaussians = {name: near_to_far(posed[name], views[name][1]) for name in views}, posed["head"]
 
     def without(name: str, share: float) -> np.ndarray:
-        return draw_avatar(avatar, *views[name], without_nearest(len(gaussians), orders[name], share))
+        return measuring.draw_avatar(avatar, *views[name], without_nearest(len(gaussians), orders[name], share))
 
     def film() -> Iterator[np.ndarray]:
         for frame in range(75):
             share = 0.5 * frame / 74
-            yield labeled(side_by_side([without(name, share) for name in views]), f"without {100 * share:.0f} %")
+            yield measuring.labeled(
+                side_by_side([without(name, share) for name in views]), f"without {100 * share:.0f} %"
+            )
 
     pictures, values = [], {"gaussians": len(gaussians), "faint": int((gaussians.opacities < _FAINT).sum())}
     for name, order in orders.items():
         values[f"in_{name}"] = len(order)
         shares = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
-        drawn = [labeled(without(name, share), f"without {100 * share:.0f} %") for share in shares]
+        drawn = [measuring.labeled(without(name, share), f"without {100 * share:.0f} %") for share in shares]
         at = told if name == "mouth" else "The head of the person at rest"
         drawn = [*(truth if name == "mouth" else ()), *drawn]
         caption = f"{at}, without the nearest Gaussians among the {len(order):,} in view."
@@ -247,11 +235,11 @@ def _shut_frame(context: Context) -> tuple[tuple[FaceParams, Camera] | None, str
     sequence, model = context.sequences[index], context.avatar.face_model
     before = sum(len(one.tracking.face) for one in context.sequences[:index])
     face = read_face_track(context.run_dir, model)[before + timestep]
-    left, top, width, _ = mouth_box(model, face, camera := sequence.tracking.cameras[0])
+    left, top, width, _ = measuring.mouth_box(model, face, camera := sequence.tracking.cameras[0])
     picture = crop_to(torch.from_numpy(np.array(sequence.capture.images[timestep, 0])), (left, top, width, width))
     picture = cv2.resize(picture.numpy(), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     told = f"The mouth in {sequence.name}, timestep {timestep}, whose lips are shut: as filmed, then the avatar"
-    return (face, camera), told, [labeled(picture, "filmed")]
+    return (face, camera), told, [measuring.labeled(picture, "filmed")]
 
 
 def shut_lips(sequences: Sequence[TrainedSequence]) -> tuple[int, int] | None:
@@ -294,9 +282,9 @@ def beyond(context: Context) -> Result:
     index, yaws = strongest_expression(context, trained), shown_yaws(trained)
     name, most = context.avatar.face_model.expression_names[index], float(trained.highest[index])
     shown = {factor: _expressed(context, index, factor * most) for factor in (0.0, 0.5, 1.0, 1.1, 1.2, 1.3, _REACH)}
-    grid = [labeled(picture, f"{factor:g} x largest") for factor, (picture, _) in shown.items()]
-    grid += [labeled(mesh, "") for _, mesh in shown.values()]
-    views = [labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees") for yaw in yaws]
+    grid = [measuring.labeled(picture, f"{factor:g} x largest") for factor, (picture, _) in shown.items()]
+    grid += [measuring.labeled(mesh, "") for _, mesh in shown.values()]
+    views = [measuring.labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees") for yaw in yaws]
     write_video(context.folder / "beyond-expression.mp4", _expression_film(context, index, most), _FPS)
     write_video(context.folder / "beyond-view.mp4", _view_film(context, trained), _FPS)
     factors, changes = _changes(context, index, most)
@@ -336,7 +324,7 @@ def beyond(context: Context) -> Result:
 def _expressed(context: Context, index: int, value: float) -> tuple[np.ndarray, np.ndarray]:
     """The avatar at rest but for one expression, and the mesh."""
     avatar, model = context.avatar, context.avatar.face_model
-    camera = head_camera(model, avatar.subject, context.camera, SIDE)
+    camera = measuring.head_camera(model, avatar.subject, context.camera, SIDE)
     return _avatar_and_mesh(context, with_expression(avatar.subject, index, value), camera)
 
 
@@ -348,13 +336,13 @@ def _changes(context: Context, index: int, most: float) -> tuple[np.ndarray, np.
 
 
 def _seen_from(context: Context, trained: Trained, yaw: float) -> np.ndarray:
-    return draw_avatar(context.avatar, context.avatar.subject, view_from(context, trained, yaw))
+    return measuring.draw_avatar(context.avatar, context.avatar.subject, view_from(context, trained, yaw))
 
 
 def _expression_film(context: Context, index: int, most: float) -> Iterator[np.ndarray]:
     for frame in range(60):
         factor = _REACH * frame / 59
-        yield labeled(side_by_side(_expressed(context, index, factor * most)), f"{factor:.2f} x largest")
+        yield measuring.labeled(side_by_side(_expressed(context, index, factor * most)), f"{factor:.2f} x largest")
 
 
 def _view_film(context: Context, trained: Trained) -> Iterator[np.ndarray]:
@@ -362,7 +350,7 @@ def _view_film(context: Context, trained: Trained) -> Iterator[np.ndarray]:
     for frame in range(60):
         yaw = first + (last - first) * frame / 59
         told = "seen" if trained.yaws[0] <= yaw <= trained.yaws[1] else "unseen"
-        yield labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees, {told}")
+        yield measuring.labeled(_seen_from(context, trained, yaw), f"{math.degrees(yaw):+.0f} degrees, {told}")
 
 
 def strongest_expression(context: Context, trained: Trained) -> int:
@@ -380,7 +368,7 @@ def shown_yaws(trained: Trained) -> list[float]:
 def view_from(context: Context, trained: Trained, yaw: float) -> Camera:
     """The camera, moved around the person at rest until the head sees it at this yaw, in radians."""
     subject = context.avatar.subject
-    camera = head_camera(context.avatar.face_model, subject, context.camera, SIDE)
+    camera = measuring.head_camera(context.avatar.face_model, subject, context.camera, SIDE)
     return turned_camera(camera, subject.head_translation[0], yaw - trained.yaw_at_rest, 0.0)
 
 
@@ -390,7 +378,7 @@ def sizes(context: Context) -> Result:
     machine = format_machine(measure_machine(gpu=context.like.is_cuda))
     rows: list[dict[str, Any]] = []
     for side in track_progress(list(SIZES), "sizes", len(SIZES)):
-        row = measure_drawing(context.timed_avatar, context.camera.fitted(side, side), seconds, face)
+        row = measuring.measure_drawing(context.timed_avatar, context.camera.fitted(side, side), seconds, face)
         rows.append({**row, "frame_ms": round(row["draw_ms"] + row["pose_ms"], 3), "paper_ms": SIZES[side]})
     cells = [
         (
@@ -400,7 +388,7 @@ def sizes(context: Context) -> Result:
         for row in rows
     ]  # fmt: skip
     heading = ("Width x height", "Frame, ms", "Paper, ms", "Features and network, ms", "Drawing, ms", "Pictures timed")
-    count, threads, place = len(context.avatar.store), rows[0]["threads"], measured_on(rows[0])
+    count, threads, place = len(context.avatar.store), rows[0]["threads"], measuring.measured_on(rows[0])
     names = ("width", "frame_ms", "paper_ms")
     sides, ours, paper = (np.array([row[name] for row in rows], np.float64) for name in names)
     slower = rows[-1]["frame_ms"] / max(rows[0]["frame_ms"], 1e-6)
@@ -433,7 +421,7 @@ def ablations(context: Context) -> Result:
     configs = ablation_configs(config)
     context.say_how_long("ablations", len(configs))
     runs = {name: context.train(f"ablation-{name.replace('_', '-')}", one) for name, one in configs.items()}
-    metric, notes = perceptual_metric()
+    metric, notes = measuring.perceptual_metric()
     widths: dict[int, float] = {}
     if context.options.widen:
         runs["no_blending"], widths = widened(context, configs["no_blending"], runs["no_blending"])
@@ -442,9 +430,9 @@ def ablations(context: Context) -> Result:
     camera, face = context.camera.fitted(TIMED_SIDE, TIMED_SIDE), busy_face(context)
     rows: list[dict[str, Any]] = []
     for name, run in runs.items():
-        drawn = measure_drawing(run.timed_avatar, camera, context.options.seconds, face)
+        drawn = measuring.measure_drawing(run.timed_avatar, camera, context.options.seconds, face)
         row = {"gaussians": run.summary["gaussians"], "frame_ms": round(drawn["draw_ms"] + drawn["pose_ms"], 2)}
-        rows.append({"name": name, **row, **held_out_scores(run, metric)})
+        rows.append({"name": name, **row, **measuring.held_out_scores(run, metric)})
     if "no_perceptual" not in configs:
         notes.append(
             "This run has no perceptual loss, so there is no row without it; train the run with "
@@ -453,7 +441,7 @@ def ablations(context: Context) -> Result:
     cells = []
     for row in rows:
         label, *paper = ABLATIONS[row["name"]]
-        cells.append((label, row["gaussians"], round(row["frame_ms"], 1), *score_cells(row), *paper))
+        cells.append((label, row["gaussians"], round(row["frame_ms"], 1), *measuring.score_cells(row), *paper))
     heading = (
         "", "Gaussians", "Frame, ms", "PSNR, dB", "SSIM", "ST-LPIPS", "Paper: Gaussians", "Paper: frame, ms",
         "Paper: PSNR, dB",
@@ -462,7 +450,7 @@ def ablations(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows, "widths": widths},
         ablation_findings(context.options.steps, rows),
         [Table(heading, cells, "Scores are those of the head crop, means over held-out frames.")],
-        pictures=picture_of_runs("ablations", runs, _strongest),
+        pictures=measuring.picture_of_runs("ablations", runs, _strongest),
         notes=[
             f"All trainings have the same data, settings, seed and {context.options.steps:,} steps, which shorten all "
             "schedules alike. The paper trains 50,000. No limit holds the number of Gaussians.",
@@ -495,7 +483,7 @@ def widened(context: Context, config: HeadGasConfig, run: Run) -> tuple[Run, dic
         The last run that gained as much, and the score of each width in dB, or none if nothing was held out.
     """
     best, width, scores = run, config.hidden, {}
-    while (score := held_out_scores(run, None)["head_psnr"]) is not None:
+    while (score := measuring.held_out_scores(run, None)["head_psnr"]) is not None:
         gained, scores[width] = score - max(scores.values(), default=-math.inf), score
         best = run if gained >= PLATEAU else best
         width *= 2
@@ -523,6 +511,5 @@ def ablation_findings(steps: int, rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _strongest(experiment: Experiment) -> Frame:
-    """The held-out frame with the strongest expression."""
     rest = experiment.avatar.subject.expression
     return max(experiment.held_out_frames, key=lambda frame: float((experiment.face(frame).expression - rest).norm()))

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median_high
 from typing import Any
 
 import cv2
@@ -70,16 +70,12 @@ def measure_drawing(
             spent = end - began
     counted = slice(1 if len(draws) > 1 else 0, None)
     return {
-        "width": camera.width,
-        "height": camera.height,
-        "gaussians": len(avatar.store),
-        "threads": 0 if like.is_cuda else _native.thread_count(),
-        "draw_ms": _median(draws[counted]),
-        "pose_ms": _median(poses[counted]),
-        "pictures": len(draws[counted]),
+        "width": camera.width, "height": camera.height, "gaussians": len(avatar.store),
+        "threads": 0 if like.is_cuda else _native.thread_count(), "draw_ms": round(median_high(draws[counted]), 3),
+        "pose_ms": round(median_high(poses[counted]), 3), "pictures": len(draws[counted]),
         "peak_mb": round(max(gpu_memory_mb(like.device) or _memory_mb("VmHWM"), before), 1),
         "before_mb": round(before, 1),
-    }
+    }  # fmt: skip
 
 
 def measure_in_turn(avatars: Sequence[Avatar], camera: Camera, seconds: float) -> list[float]:
@@ -97,11 +93,7 @@ def measure_in_turn(avatars: Sequence[Avatar], camera: Camera, seconds: float) -
                 start = _now(like)
                 rasterize(gaussians, camera.to(like), like.new_ones(3))
                 own.append(1e3 * (_now(like) - start))
-    return [_median(own[1:]) for own in times]
-
-
-def _median(values: list[float]) -> float:
-    return round(sorted(values)[len(values) // 2], 3)
+    return [round(median_high(own[1:]), 3) for own in times]
 
 
 def _now(like: Tensor) -> float:

@@ -17,16 +17,7 @@ from mien.avatar.settings import Progress
 from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, target_image
 from mien.evaluation.metrics import psnr
-from mien.lab.analysis.measuring import (
-    head_picture,
-    held_out_scores,
-    labeled,
-    measure_drawing,
-    measured_on,
-    perceptual_metric,
-    picture_of_runs,
-    score_cells,
-)
+from mien.lab.analysis import measuring
 from mien.lab.analysis.result import Chart, Picture, Result, Table
 from mien.lab.analysis.running import Context, Run
 from mien.lab.benchmarking.timing import format_machine, measure_machine
@@ -58,7 +49,7 @@ def times(context: Context) -> Result:
     rows: dict[str, dict[str, float | int]] = {}
     for name, training in (("networks", True), ("baked", False)):
         avatar.train(training)
-        rows[name] = measure_drawing(avatar, context.camera.fitted(SIDE, SIDE), context.options.seconds)
+        rows[name] = measuring.measure_drawing(avatar, context.camera.fitted(SIDE, SIDE), context.options.seconds)
     frames = {name: round(row["draw_ms"] + row["pose_ms"], 3) for name, row in rows.items()}
     hours, count = context.summary["seconds"] / 3600, len(avatar.store)
     cells: list[tuple[str | float | None, ...]] = [
@@ -76,7 +67,7 @@ def times(context: Context) -> Result:
             "rows": rows,
         },
         [
-            f"{count:,} Gaussians, {measured_on(rows['baked'])}: training took {60 * hours:.1f} min, and a "
+            f"{count:,} Gaussians, {measuring.measured_on(rows['baked'])}: training took {60 * hours:.1f} min, and a "
             f"frame of the baked avatar takes {frames['baked']:.1f} ms at {SIDE}x{SIDE} (paper, on a GPU: 9 h and "
             "30 ms)."
         ],
@@ -99,12 +90,12 @@ def convergence(context: Context) -> Result:
     frames = spread_frames(experiment.held_out_frames, 8)
     targets = [target_image(experiment, frame) for frame in frames]
     steps = sorted({max(1, round(share * context.options.steps)) for share in (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)})
-    rows, tiles = [], [labeled(head_picture(experiment, frames[0], targets[0]), "truth")]
+    rows, tiles = [], [measuring.labeled(measuring.head_picture(experiment, frames[0], targets[0]), "truth")]
     for reached, gaussians, pictures in _snapshots(context, experiment, frames, steps):
         drawn_and_true = zip(pictures, targets, frames, strict=True)
         scores = [psnr(picture, target, experiment.crop(frame)) for picture, target, frame in drawn_and_true]
         rows.append({"step": reached, "gaussians": gaussians, "head_psnr": round(float(np.mean(scores)), 3)})
-        tiles.append(labeled(head_picture(experiment, frames[0], pictures[0]), f"step {reached}"))
+        tiles.append(measuring.labeled(measuring.head_picture(experiment, frames[0], pictures[0]), f"step {reached}"))
     x, y, counts = (np.array([row[name] for row in rows], float) for name in ("step", "head_psnr", "gaussians"))
     near = next(row["step"] for row in rows if row["head_psnr"] >= max(y) - 1)
     points = Axes("step", "points", from_zero=True)
@@ -170,7 +161,7 @@ def resolutions(context: Context) -> Result:
     capture = max(max(one.tracking.cameras[0].width, one.tracking.cameras[0].height) for one in context.sequences)
     full = min(context.settings.resolution or capture, capture)
     context.say_how_long("resolutions", 2)
-    runs, rows, (metric, notes) = {}, [], perceptual_metric()
+    runs, rows, (metric, notes) = {}, [], measuring.perceptual_metric()
     small = full < max(GAINS)
     for side in (full, max(16, full // 2)) if small else (max(GAINS), min(GAINS)):
         name, gain = f"{side} pixels", scale_gain(side)
@@ -182,7 +173,7 @@ def resolutions(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         [_finding(rows)],
         [Table(heading, cells, "Scores are those of the head crop at full size, means over held-out frames.")],
-        pictures=picture_of_runs("resolutions", runs, _middle),
+        pictures=measuring.picture_of_runs("resolutions", runs, _middle),
         notes=[
             "The paper trains at 512x512 and at 1024x1024, and gives scales a smaller bound at 1024x1024. Here, each "
             "training has the bound of the nearer of these sizes; all else is as in the run, which has the paper's "
@@ -202,14 +193,12 @@ def diversity(context: Context) -> Result:
     """The same short training on all frames, on two clips by time as in the paper, and on two choices by pose: A.4."""
     measured = measure(context.sequences, training_frames(context.sequences, context.settings))
     subsets = {
-        "all frames": list(range(len(measured.timesteps))),
-        "frontal clip": clip(measured, 0.25, mixed=False),
-        "mixed clip": clip(measured, 0.5, mixed=True),
-        "frontal quarter": frontal_quarter(measured),
+        "all frames": list(range(len(measured.timesteps))), "frontal clip": clip(measured, 0.25, mixed=False),
+        "mixed clip": clip(measured, 0.5, mixed=True), "frontal quarter": frontal_quarter(measured),
         "mixed half": mixed_half(measured),
-    }
+    }  # fmt: skip
     context.say_how_long("diversity", len(subsets))
-    runs, rows, (metric, notes) = {}, [], perceptual_metric()
+    runs, rows, (metric, notes) = {}, [], measuring.perceptual_metric()
     for name, chosen in subsets.items():
         timesteps = masks(context.sequences, measured, chosen)
         runs[name] = context.train(f"diversity-{name.replace(' ', '-')}", context.avatar.config, timesteps=timesteps)
@@ -225,7 +214,7 @@ def diversity(context: Context) -> Result:
         {"steps": context.options.steps, "rows": rows},
         [_finding(rows)],
         [Table(heading, cells, "Scores are those of the head crop, means over the same held-out frames.")],
-        pictures=picture_of_runs("diversity", runs, _middle),
+        pictures=measuring.picture_of_runs("diversity", runs, _middle),
         notes=[
             "The paper has a frontal clip of 30 s and a mixed one of 60 s, of 120 s. Here, they are successive "
             "timesteps, a quarter and half of all: with the views nearest to the median one, and with the most varied.",
@@ -239,11 +228,13 @@ def diversity(context: Context) -> Result:
 
 
 def _scored(run: Run, metric: PerceptualDistance | None) -> dict[str, Any]:
-    return {name: run.summary[name] for name in ("gaussians", "step_ms_median")} | held_out_scores(run, metric)
+    return {name: run.summary[name] for name in ("gaussians", "step_ms_median")} | measuring.held_out_scores(
+        run, metric
+    )
 
 
 def _cells(row: dict[str, Any]) -> tuple[float | int | None, ...]:
-    return (row["gaussians"], round(row["step_ms_median"], 1), *score_cells(row))
+    return (row["gaussians"], round(row["step_ms_median"], 1), *measuring.score_cells(row))
 
 
 def _finding(rows: list[dict[str, Any]]) -> str:

@@ -79,14 +79,12 @@ class Result:
         for picture in self.pictures:
             write_png(folder / f"{picture.name}.png", picture.image)
         return {
-            "values": dict(self.values),
-            "findings": list(self.findings),
+            "values": dict(self.values), "findings": list(self.findings),
             "tables": [asdict(table) for table in self.tables],
             "charts": [_chart_content(chart) for chart in self.charts],
             "pictures": [{"file": f"{one.name}.png", "caption": one.caption} for one in self.pictures],
-            "films": [asdict(film) for film in self.films],
-            "notes": list(self.notes),
-        }
+            "films": [asdict(film) for film in self.films], "notes": list(self.notes),
+        }  # fmt: skip
 
 
 def section_html(title: str, part: Mapping[str, Any], folder: Path) -> Markup:

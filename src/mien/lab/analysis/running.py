@@ -120,13 +120,9 @@ class Context(Run):
         return replace(self.settings, steps=self.options.steps, device=device)
 
     def train(
-        self,
-        name: str,
-        config: MethodConfig,
-        face_model: FaceModel | None = None,
-        resolution: int | None = None,
+        self, name: str, config: MethodConfig, face_model: FaceModel | None = None, resolution: int | None = None,
         timesteps: Sequence[Bool[Tensor, " t"]] | None = None,
-    ) -> Run:
+    ) -> Run:  # fmt: skip
         """Train the run's sequences again for `options.steps` steps, with something changed.
 
         A stopped training continues, and a finished one is only read. `resolution` is the longer side of the training
@@ -161,13 +157,9 @@ class Context(Run):
 
 
 def run_analysis(
-    analysis: Analysis,
-    parts: Sequence[Part],
-    run_dir: Path,
-    sequence_dirs: Sequence[Path],
-    folder: Path,
+    analysis: Analysis, parts: Sequence[Part], run_dir: Path, sequence_dirs: Sequence[Path], folder: Path,
     options: AnalysisOptions,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Run some parts of an analysis on a finished run, and return the content of analysis.json.
 
     A part that was computed before, for the same avatar and options, is kept. Each part is written once it is done.
@@ -187,14 +179,9 @@ def run_analysis(
         folder.mkdir(parents=True, exist_ok=True)
         avatar = file_digest(run_dir / "avatar" / "avatar.safetensors")
         content = {
-            "run": run_dir.name,
-            "method": analysis.method,
-            "paper": analysis.paper,
-            "avatar": avatar,
-            "parts": _known(record, analysis, avatar),
-            "mien": mien.__version__,
-            "command_line": sys.argv,
-        }
+            "run": run_dir.name, "method": analysis.method, "paper": analysis.paper, "avatar": avatar,
+            "parts": _known(record, analysis, avatar), "mien": mien.__version__, "command_line": sys.argv,
+        }  # fmt: skip
         context = Context(run_dir, tuple(sequence_dirs), like_on(choose_device(options.device)), folder, options)
         for part in parts:
             timed = [options.seconds, _native.thread_count()] if part.timed else None
@@ -205,8 +192,7 @@ def run_analysis(
                 say(f"{part.name}: measured before")
             else:
                 run = named(f"mien.lab.analysis.{analysis.method}:{part.name.replace('-', '_')}")
-                result = json.loads(json.dumps(run(context).write(folder)))
-                content["parts"][part.name] = {"key": key, **result}
+                content["parts"][part.name] = {"key": key, **json.loads(json.dumps(run(context).write(folder)))}
                 write_json(record, _FORMAT, _VERSION, content)
             for finding in content["parts"][part.name]["findings"]:
                 say(f"{part.name}: {finding}")

@@ -111,11 +111,9 @@ def _means(
 
 
 def _lines(
-    capture: str,
-    protocol: str,
-    rows: Sequence[tuple[str, dict[str, float | None]]],
+    capture: str, protocol: str, rows: Sequence[tuple[str, dict[str, float | None]]],
     columns: Sequence[tuple[str, str, int, bool]],
-) -> list[Sequence[str]]:
+) -> list[Sequence[str]]:  # fmt: skip
     """Rows of one group. The best quality is bold if several rows have the figure."""
     best: dict[str, str] = {}
     for name, _, digits, higher in _QUALITY:
@@ -133,6 +131,11 @@ def _lines(
         first = (capture, protocol.replace("_", " ")) if index == 0 else ("", "")
         lines.append((*first, method, *cells))
     return lines
+
+
+def known(value: float | None, form: str = "{:.3f}") -> str:
+    """A figure for a table; "-" if there is none."""
+    return "-" if value is None else form.format(value)
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

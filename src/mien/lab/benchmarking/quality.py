@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.lab.benchmarking.comparing import markdown
+from mien.lab.benchmarking.comparing import known, markdown
 from mien.lab.synthetic.truth import Truth
 from mien.machine import exact
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
@@ -91,16 +91,13 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
     still = still_timesteps(expected)
     jitter_m = jitter(placed, still)
     return TrackingErrors(
-        vertex_mm=1e3 * float(np.mean(vertex)),
-        landmark_px=float(np.mean(pixel)),
-        rotation_deg=mean,
-        rotation_steady_deg=steady,
-        jitter_px=jitter(projected, still),
+        vertex_mm=1e3 * float(np.mean(vertex)), landmark_px=float(np.mean(pixel)), rotation_deg=mean,
+        rotation_steady_deg=steady, jitter_px=jitter(projected, still),
         jitter_mm=None if jitter_m is None else 1e3 * jitter_m,
         blinks=blink_following(projected, expected, truth, capture.fps),
         turns=turn_following(tracking, truth, capture.fps),
         iris_deviation_percent=residual_report(capture, tracking, face_model)["iris_distance"]["deviation_percent"],
-    )
+    )  # fmt: skip
 
 
 def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) -> Float[np.ndarray, "t c l 2"]:
@@ -236,8 +233,7 @@ def turn_following(tracking: Tracking, truth: Truth, fps: float) -> Following | 
     middle = mean_rotation(true)
     signals = [axis_angle_from_matrix(middle.T @ turns).numpy() for turns in (tracked @ steady, true)]
     speed = axis_angle_from_matrix(true[:-1].mT @ true[1:]).norm(dim=-1).numpy() * fps
-    fast = np.concatenate([speed > np.radians(15.0), [False]])
-    return following(signals[0], signals[1], fast, _around(fps))
+    return following(signals[0], signals[1], np.concatenate([speed > np.radians(15.0), [False]]), _around(fps))
 
 
 def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor, "3 3"]:
@@ -248,8 +244,7 @@ def mean_rotation(rotations: Float[torch.Tensor, "n 3 3"]) -> Float[torch.Tensor
 
 def still_timesteps(true: Float[np.ndarray, "t c l 2"]) -> Bool[np.ndarray, " t2"]:
     """Return, for all timesteps but the first and the last, whether true landmarks stand still around them."""
-    moving = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1)
-    still = moving < 0.02  # pixels a frame
+    still = np.linalg.norm(np.diff(true[:, 0], axis=0), axis=-1).max(-1) < 0.02  # pixels a frame
     return still[1:] & still[:-1]
 
 
@@ -319,14 +314,14 @@ def unseen_table(name: str, views: dict[str, Any]) -> str:
     rows = []
     for angle, row in views.items():
         crops = [row[what]["head"] for what in ("avatar", "mesh")]
-        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {_known(head['perceptual'], '{:.3f}')}" for head in crops]
+        cells = [f"{head['psnr']:.2f} / {head['ssim']:.3f} / {known(head['perceptual'])}" for head in crops]
         rows.append((angle, *cells))
     return markdown(heads, rows)
 
 
 def tracking_cells(errors: TrackingErrors) -> list[str]:
     """Return the figures of one sequence as cells of a table."""
-    pixels, world = _known(errors.jitter_px, "{:.3f} px"), _known(errors.jitter_mm, "{:.3f} mm")
+    pixels, world = known(errors.jitter_px, "{:.3f} px"), known(errors.jitter_mm, "{:.3f} mm")
     return [
         f"{errors.vertex_mm:.2f} mm", f"{errors.landmark_px:.2f} px",
         f"{errors.rotation_deg:.2f} ({errors.rotation_steady_deg:.2f}) deg",
@@ -335,14 +330,10 @@ def tracking_cells(errors: TrackingErrors) -> list[str]:
             "-" if one is None else f"{one.lag_frames:.2f} frames, {one.loss_percent:.0f} % ({one.events})"
             for one in (errors.blinks, errors.turns)
         ),
-        _known(errors.iris_deviation_percent, "{:.2f} %"),
+        known(errors.iris_deviation_percent, "{:.2f} %"),
     ]  # fmt: skip
 
 
-def _known(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
 def _figures(entry: dict[str, Any]) -> str:
-    last = _known(entry.get("perceptual"), "{:.3f}")
+    last = known(entry.get("perceptual"))
     return f"{entry['psnr']:.2f} / {entry['ssim']:.3f} / {entry['l1']:.4f} / {last}"

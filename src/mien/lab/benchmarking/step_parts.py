@@ -16,15 +16,8 @@ from mien import _native
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
+from mien.lab.benchmarking import train_step
 from mien.lab.benchmarking.timing import thread_counts
-from mien.lab.benchmarking.train_step import (
-    TIMESTEPS,
-    benchmark_sequence,
-    case_data,
-    empty_statistics,
-    paint_targets,
-    training_case,
-)
 from mien.machine.terminal import counted
 from mien.training import trainer
 from mien.training.checkpoint import TrainingState
@@ -135,7 +128,7 @@ def step_parts(
     The state moves on. Native operations are watched wherever they are called, so every one of a step is counted.
     """
     fastest: dict[tuple[str, str], float] = {}
-    for _ in range(TIMESTEPS):  # until each picture was made once
+    for _ in range(train_step.TIMESTEPS):  # until each picture was made once
         step(state, data, settings)
     end = time.perf_counter() + seconds
     while not fastest or time.perf_counter() < end:
@@ -159,14 +152,14 @@ def default_case(
     """
     preset = PRESETS["standard"]
     settings = replace(preset.settings_of(DEFAULT_METHOD), steps=10_000_000, split="none")
-    sequence = benchmark_sequence(face_model, *size)
-    painter, _ = training_case(face_model, len(face_model.faces), *size)
-    paint_targets(sequence, painter.avatar)
+    sequence = train_step.benchmark_sequence(face_model, *size)
+    painter, _ = train_step.training_case(face_model, len(face_model.faces), *size)
+    train_step.paint_targets(sequence, painter.avatar)
     state = start([sequence], face_model, preset.config(DEFAULT_METHOD), settings)
     settings = resolved(settings, filled=state.head is not None and state.head.fills)
     _grow(state, count)
     state.step = 6_000_000  # All losses have begun, and no density control is due.
-    return state, case_data(sequence, settings), settings
+    return state, train_step.case_data(sequence, settings), settings
 
 
 def _grow(state: TrainingState, count: int) -> None:
@@ -187,7 +180,7 @@ def _grow(state: TrainingState, count: int) -> None:
     for name, values in drawn.items():
         store.assign_rows(name, trained, values)
     assert state.density is not None
-    state.density.load_state(empty_statistics(len(store)))
+    state.density.load_state(train_step.empty_statistics(len(store)))
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from mien.avatar.avatar import Avatar
 from mien.camera import Camera
 from mien.evaluation.scoring import PART_SIDE, ScoreSettings, as_8_bit, enlarged, perceptual_metric
 from mien.face.params import FaceParams
-from mien.lab.benchmarking.comparing import markdown
+from mien.lab.benchmarking.comparing import known, markdown
 from mien.lab.synthetic.anatomy import BROWS_LOWER, BROWS_UPPER, LIPS_INNER, LIPS_OUTER, LOWER_LIDS, UPPER_LIDS
 from mien.lab.synthetic.posing import head_pose
 from mien.lab.synthetic.scene import SyntheticScene
@@ -151,11 +151,9 @@ def _figures(rows: Sequence[tuple[str, bool, float, float, float | None]]) -> Fi
         distances = [row[4] for row in moved if row[4] is not None]
         own = fmean(row[2] for row in moved)
         figures[region] = {
-            "psnr": fmean(row[3] for row in moved),
-            "perceptual": fmean(distances) if distances else None,
-            "faces": len(moved),
-            "cross_talk": fmean(others) / own if others and own > 0 else None,
-        }
+            "psnr": fmean(row[3] for row in moved), "perceptual": fmean(distances) if distances else None,
+            "faces": len(moved), "cross_talk": fmean(others) / own if others and own > 0 else None,
+        }  # fmt: skip
     return figures
 
 
@@ -176,17 +174,13 @@ def unfilmed_table(name: str, key: str, figures: Mapping[str, Figures]) -> str:
     rows = []
     for region in [one for one in REGIONS if any(one in own for own in figures.values())]:
         cells = [
-            f"{own[region]['psnr']:.2f} / {_known(own[region]['perceptual'])}, {_known(own[region]['cross_talk'])}"
+            f"{own[region]['psnr']:.2f} / {known(own[region]['perceptual'])}, {known(own[region]['cross_talk'])}"
             for own in figures.values()
         ]
         rows.append((region, *cells))
     over = [means(own) for own in figures.values()]
-    rows.append(("mean", *(f"{one['psnr']:.2f} / {_known(one['perceptual'])}" for one in over)))
+    rows.append(("mean", *(f"{one['psnr']:.2f} / {known(one['perceptual'])}" for one in over)))
     return markdown(heads, rows)
-
-
-def _known(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 def means(figures: Figures) -> dict[str, float | None]:
@@ -228,8 +222,7 @@ def _masks(pictures: PosedPictures, timestep: int, camera: int) -> Mapping[str, 
         area = np.zeros(size, np.uint8)
         for points in marks:
             for polygon in polygons:
-                corners = np.round(points[list(polygon)] * 16).astype(np.int32)
-                cv2.fillPoly(area, [corners], 1, cv2.LINE_8, 4)
+                cv2.fillPoly(area, [np.round(points[list(polygon)] * 16).astype(np.int32)], 1, cv2.LINE_8, 4)
         if margin:
             width = 2 * max(1, round(margin * eye)) + 1
             area = cv2.dilate(area, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
@@ -240,8 +233,7 @@ def _masks(pictures: PosedPictures, timestep: int, camera: int) -> Mapping[str, 
 
 def _sheet(pictures: PosedPictures, drawn: Mapping[tuple[int, int], Tensor]) -> np.ndarray:
     """True faces above the avatar's, in front."""
-    marks = pictures.truth.landmarks[0, 0]
-    oval = marks[list(_OVAL)]
+    oval = pictures.truth.landmarks[0, 0][list(_OVAL)]
     middle, half = oval.mean(0), 0.62 * float(np.ptp(oval[:, 1]))
     rows, columns = (slice(max(int(c - half), 0), int(c + half)) for c in middle[::-1])
 

@@ -177,13 +177,9 @@ def score_side_views(
 
 
 def _job(
-    experiment: Experiment,
-    index: int,
-    pictures: SidePictures,
-    shared: tuple[Float[Tensor, "v 3"], NeckParts],
-    camera: int,
-    moment: int,
-) -> _Job:
+    experiment: Experiment, index: int, pictures: SidePictures, shared: tuple[Float[Tensor, "v 3"], NeckParts],
+    camera: int, moment: int,
+) -> _Job:  # fmt: skip
     """Draw the avatar and the mesh of a sequence as a camera sees them at a moment, beside the true picture.
 
     All jobs share the completed colours of the mesh and the parts of its neck.

@@ -69,8 +69,7 @@ def _temple(anatomy: Anatomy, rim: np.ndarray, side: float) -> Float[np.ndarray,
     z = np.linspace(outer[2], z_ear - 0.012, 20)
     share = np.linspace(0, 1, 20)
     y = outer[1] + (y_ear - outer[1]) * share - 0.022 * smoothstep(0.85, 1.0, share)
-    skull = np.stack([np.full(20, 0.07 * side), y, z], -1) - anatomy.skull_center
-    around = unit(skull)
+    around = unit(np.stack([np.full(20, 0.07 * side), y, z], -1) - anatomy.skull_center)
     x_skin = np.abs(anatomy.skull_center[0] + around[:, 0] * anatomy.skull_radius(around))
     x = np.maximum(x_skin + 0.0025, np.abs(outer[0]) * (1 - share) + 0.06 * share)
     x[0] = np.abs(outer[0])
@@ -80,8 +79,7 @@ def _temple(anatomy: Anatomy, rim: np.ndarray, side: float) -> Float[np.ndarray,
 
 
 def _tube(path: Float[np.ndarray, "p 3"], radius: float, *, closed: bool, sides: int = 8) -> RigidMesh:
-    following = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
-    tangent = unit(following)
+    tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0))
     reference = np.where(np.abs(tangent[:, 2:3]) > 0.8, [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
     first = unit(np.cross(tangent, reference))
     second = np.cross(tangent, first)
@@ -102,11 +100,8 @@ def _lens(rim: Float[np.ndarray, "p 3"], side: float) -> RigidMesh:
 
 
 def build_shirt(
-    neck: Float[np.ndarray, " 3"],
-    neck_size: tuple[float, float],
-    shoulder_points: Float[np.ndarray, "p 3"],
-    seed: int,
-) -> RigidMesh:
+    neck: Float[np.ndarray, " 3"], neck_size: tuple[float, float], shoulder_points: Float[np.ndarray, "p 3"], seed: int,
+) -> RigidMesh:  # fmt: skip
     """Build shoulders in a shirt with a round collar, which covers the shoulders' points.
 
     `neck` is the middle of the neck at the height of the collar, `neck_size` its half width and half depth there.
@@ -136,8 +131,7 @@ def build_shirt(
     z = ahead + deep * _power(sine, power)
     # The collar is lower in front than at the nape.
     y = height - 0.13 * np.clip(z, -0.06, 0.06) * smoothstep(-0.12, 0.0, height)
-    grid = neck + np.stack(np.broadcast_arrays(x, y, z), -1)
-    vertices = _laid_over(grid, shoulder_points).reshape(-1, 3)
+    vertices = _laid_over(neck + np.stack(np.broadcast_arrays(x, y, z), -1), shoulder_points).reshape(-1, 3)
     folds = noise.octaves(vertices * np.array([1, 0.5, 1]), 0.06, 3) * smoothstep(
         -0.02, -0.08, vertices[:, 1] - neck[1]
     )

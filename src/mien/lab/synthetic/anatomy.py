@@ -59,8 +59,7 @@ class Anatomy:
 
     def curve(self, indices: tuple[int, ...], points: int) -> Float[np.ndarray, "p 3"]:
         """Return points at equal distances along a chain of landmarks."""
-        corners = self.landmarks[list(indices)]
-        return resample(corners, points)
+        return resample(self.landmarks[list(indices)], points)
 
     @cached_property
     def skull_center(self) -> Float[np.ndarray, " 3"]:
@@ -74,8 +73,7 @@ class Anatomy:
     def _radii(self) -> Float[np.ndarray, "e a"]:
         """Distance of the skin from the skull's centre by direction, without the ears."""
         faces = self.faces[self.skin & ~self.region("ears")]
-        random = np.random.default_rng(0)
-        weights = random.dirichlet((1, 1, 1), (len(faces), 24)).astype(np.float32)
+        weights = np.random.default_rng(0).dirichlet((1, 1, 1), (len(faces), 24)).astype(np.float32)
         points = exact.product(weights, self.vertices[faces]).reshape(-1, 3) - self.skull_center
         radius = exact.length(points)
         row, column = _cells(points / radius[:, None])
@@ -86,8 +84,7 @@ class Anatomy:
             known = (wrapped > 0).astype(np.float32)
             spread = cv2.blur(wrapped, (3, 3)) / np.maximum(cv2.blur(known, (3, 3)), 1e-6)
             wrapped = np.where(wrapped > 0, wrapped, np.where(cv2.blur(known, (3, 3)) > 0.05, spread, 0))
-        smooth = cv2.GaussianBlur(wrapped, (0, 0), 1.2)
-        return smooth[:, _AZIMUTHS : 2 * _AZIMUTHS]
+        return cv2.GaussianBlur(wrapped, (0, 0), 1.2)[:, _AZIMUTHS : 2 * _AZIMUTHS]
 
     def skull_radius(self, directions: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
         """Return the smoothed distance of the skin, without ears, from `skull_center` in unit directions."""
@@ -119,12 +116,9 @@ def measure_anatomy(model: FaceModel, identity: torch.Tensor) -> Anatomy:
     """Return the anatomy of a person at rest."""
     rest, faces = rest_vertices(model, identity), model.faces.numpy()
     return Anatomy(
-        model=model,
-        vertices=rest,
-        normals=exact.vertex_normals(rest, faces),
-        faces=faces,
+        model=model, vertices=rest, normals=exact.vertex_normals(rest, faces), faces=faces,
         landmarks=landmark_positions(model, rest),
-    )
+    )  # fmt: skip
 
 
 def resample(corners: Float[np.ndarray, "c 3"], points: int) -> Float[np.ndarray, "p 3"]:

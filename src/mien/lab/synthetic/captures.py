@@ -203,31 +203,20 @@ class Pictures:
 
 
 def _make_capture(
-    scene: SyntheticScene,
-    images: np.ndarray,
-    mattes: np.ndarray,
-    landmarks: np.ndarray,
-    source: dict,
+    scene: SyntheticScene, images: np.ndarray, mattes: np.ndarray, landmarks: np.ndarray, source: dict,
     calibration: tuple[Camera, ...] | None,
-) -> Capture:
+) -> Capture:  # fmt: skip
     recipe = scene.recipe
     return Capture(
-        name=recipe.name,
-        camera_ids=recipe.camera_ids,
-        fps=recipe.fps,
-        timestamps=np.array(scene.moments or range(scene.timesteps)) / recipe.fps,
-        images=images,
-        mattes=mattes,
-        landmarks=landmarks,
-        valid=np.isfinite(landmarks[..., 0, 0]),
+        name=recipe.name, camera_ids=recipe.camera_ids, fps=recipe.fps,
+        timestamps=np.array(scene.moments or range(scene.timesteps)) / recipe.fps, images=images, mattes=mattes,
+        landmarks=landmarks, valid=np.isfinite(landmarks[..., 0, 0]),
         principal_point=np.tile(np.array([recipe.width / 2, recipe.height / 2], np.float32), (len(scene.cameras), 1)),
-        source=source,
-        calibration=calibration,
-    )
+        source=source, calibration=calibration,
+    )  # fmt: skip
 
 
 def _detect_landmarks(scene: SyntheticScene, images: np.ndarray) -> Iterator[Float[np.ndarray, "t l 2"]]:
-    """Yield the landmarks that a detector finds in each camera's pictures."""
     with progress_bar(f"Detecting landmarks of {scene.recipe.name}", len(scene.cameras)) as advance:
         for camera in range(len(scene.cameras)):
             found = np.full((len(images), LANDMARKS, 2), np.nan, np.float32)

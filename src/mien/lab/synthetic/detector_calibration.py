@@ -91,12 +91,10 @@ def fit_response(people: Sequence[Sightings], components: int = _COMPONENTS) -> 
     mean = found.mean(0)
     of_people = (found - mean).flatten(1)
     return DetectorResponse(
-        mean=mean.double(),
-        by_turn=habits[:2].double(),
-        by_expression=habits[2:].double(),
+        mean=mean.double(), by_turn=habits[:2].double(), by_expression=habits[2:].double(),
         by_person=_principal_components(of_people, components).reshape(-1, *mean.shape).double(),
         rest_sigma=_unexplained(of_people, components),
-    )
+    )  # fmt: skip
 
 
 def differing_response(

@@ -191,13 +191,10 @@ def _front_points(
     weights = np.empty((len(points), 3), np.float32)
     for start in range(0, len(points), 512):
         part = points[start : start + 512]
-        away = squares - 2 * exact.product(part, centers.T)
-        near = np.argpartition(away, 12, axis=1)[:, :12]
-        barycentric = _barycentric(part[:, None], corners[near])
-        clamped = np.clip(barycentric, 0, 1)
+        near = np.argpartition(squares - 2 * exact.product(part, centers.T), 12, axis=1)[:, :12]
+        clamped = np.clip(_barycentric(part[:, None], corners[near]), 0, 1)
         clamped /= clamped.sum(-1, keepdims=True)
-        distance = exact.length(exact.mixed(clamped, corners[near]) - part[:, None])
-        best = distance.argmin(1)
+        best = exact.length(exact.mixed(clamped, corners[near]) - part[:, None]).argmin(1)
         rows = np.arange(len(part))
         faces[start : start + 512] = candidates[near[rows, best]]
         weights[start : start + 512] = clamped[rows, best]
@@ -244,8 +241,6 @@ class Lashes:
                 outwards.append(np.repeat(radial[:, None], steps, 1))
                 widths.append(np.repeat((0.0003 if curl > 0 else 0.00016) * np.linspace(1, 0.4, steps)[None], count, 0))
         return Strands(
-            np.concatenate(points).astype(np.float32),
-            np.concatenate(widths).astype(np.float32),
-            np.full((sum(map(len, points)), steps, 3), 0.012, np.float32),
-            np.concatenate(outwards).astype(np.float32),
-        )
+            np.concatenate(points).astype(np.float32), np.concatenate(widths).astype(np.float32),
+            np.full((sum(map(len, points)), steps, 3), 0.012, np.float32), np.concatenate(outwards).astype(np.float32),
+        )  # fmt: skip

@@ -51,8 +51,7 @@ class Strands:
 
     def ribbon_vertices(self, viewpoint: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "v 3"]:
         """Return two vertices per point, one width apart, across the view from `viewpoint` (head frame)."""
-        across = np.cross(self.tangents, viewpoint - self.points)
-        return ribbon(self.points, unit(across), self.widths)
+        return ribbon(self.points, unit(np.cross(self.tangents, viewpoint - self.points)), self.widths)
 
 
 def ribbon_faces(strands: int, points: int) -> Int[np.ndarray, "f 3"]:
@@ -111,8 +110,7 @@ def _scalp_points(anatomy: Anatomy, count: int, random: np.random.Generator) -> 
     faces = anatomy.faces[anatomy.skin & ~anatomy.region("ears")]
     corners = anatomy.vertices[faces]
     areas = length(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    inside = anatomy.hair_share(corners.mean(1)) > 0.02
-    weights = areas * inside
+    weights = areas * (anatomy.hair_share(corners.mean(1)) > 0.02)
     found: list[np.ndarray] = []
     total = 0
     while total < count:
@@ -136,8 +134,7 @@ def _combed(
     sweep = front * high  # from the forehead the hair goes up, aside and back
     down = -0.15 - 1.1 * (1 - top) * (1 - sweep) + 0.35 * sweep
     combed = np.stack([aside * (1 + 0.2 * sweep), down, -0.5 - 0.25 * sweep], -1)
-    locks = np.stack([noise(points + 0.1 * axis, 0.016) for axis in range(3)], -1)
-    return combed + 0.4 * locks
+    return combed + 0.4 * np.stack([noise(points + 0.1 * axis, 0.016) for axis in range(3)], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +148,7 @@ class DrapedStrands:
     def posed(self, pose: HeadPose) -> Strands:
         """Return the strands in the head frame when the shoulders are turned relative to the head."""
         points, T = self.rest.points, pose.T_head_shoulders
-        on_shoulders = exact.rotated(points, T[:3, :3], T[:3, 3])
-        moved = points + self.follow[..., None] * (on_shoulders - points)
+        moved = points + self.follow[..., None] * (exact.rotated(points, T[:3, :3], T[:3, 3]) - points)
         return Strands(moved.astype(np.float32), self.rest.widths, self.rest.colors, self.rest.outwards)
 
 

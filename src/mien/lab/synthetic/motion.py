@@ -46,7 +46,6 @@ class _Span:
 
 
 def _lay_out(recipe: SyntheticRecipe) -> tuple[_Span, ...]:
-    """Return the recipe's script as spans in time."""
     segments = recipe.script or (Segment("free", recipe.seconds),)
     ends = list(accumulate(segment.seconds for segment in segments))
     last = len(segments) - 1
@@ -209,12 +208,10 @@ def generate_motion(model: FaceModel, identity: torch.Tensor, recipe: SyntheticR
     anchor = np.array([0.0, 0.0, -recipe.distance]) + pivot + sway
     head_rotation = axis_angle_from_matrix(rotations)
     return FaceParams(
-        identity=identity,
-        expression=_expression(model, tracks, len(times)),
-        joints=_joints(model, rotations, head_rotation, gaze),
-        head_rotation=torch.from_numpy(head_rotation).float(),
+        identity=identity, expression=_expression(model, tracks, len(times)),
+        joints=_joints(model, rotations, head_rotation, gaze), head_rotation=torch.from_numpy(head_rotation).float(),
         head_translation=torch.from_numpy(anchor - exact.dot(rotations, pivot)).float(),
-    )
+    )  # fmt: skip
 
 
 def shoulder_rotation(head_rotation: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
@@ -285,11 +282,9 @@ def _expression(model: FaceModel, tracks: _Tracks, timesteps: int) -> Float[torc
 
 
 def _joints(
-    model: FaceModel,
-    rotations: Float[np.ndarray, "t 3 3"],
-    head_rotation: Float[np.ndarray, "t 3"],
+    model: FaceModel, rotations: Float[np.ndarray, "t 3 3"], head_rotation: Float[np.ndarray, "t 3"],
     gaze: Float[np.ndarray, "t 2"],
-) -> Float[torch.Tensor, "t j 3"]:
+) -> Float[torch.Tensor, "t j 3"]:  # fmt: skip
     joints = np.zeros((len(gaze), len(model.free_joint_names), 3))
     shoulders = shoulder_rotation(head_rotation)
     for column, name in enumerate(model.free_joint_names):

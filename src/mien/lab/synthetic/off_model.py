@@ -54,14 +54,12 @@ def bend_off_model(model: FaceModel, identity: Float[Tensor, " i"], strength: fl
     extra = torch.from_numpy(strength * _extra_fields(points, free, noise)).float()
     count, joints = len(extra), model.joint_rotation_basis.shape[1]
     drawn = replace(
-        model,
-        template=model.template + offsets,
-        expression_basis=torch.cat([basis, extra]),
+        model, template=model.template + offsets, expression_basis=torch.cat([basis, extra]),
         expression_names=(*model.expression_names, *(f"offModel{index}" for index in range(count))),
         expression_bounds=torch.cat([model.expression_bounds, torch.tensor([[0.0, 1.0]]).expand(count, 2)]),
         joint_rotation_basis=torch.cat([model.joint_rotation_basis, torch.zeros(count, joints, 3)]),
         joint_translation_basis=torch.cat([model.joint_translation_basis, torch.zeros(count, joints, 3)]),
-    )
+    )  # fmt: skip
     return OffModel(drawn, offsets)
 
 
@@ -76,7 +74,6 @@ def _away_from_eyes(model: FaceModel, points: np.ndarray) -> Float[np.ndarray, "
 
 
 def _field(points: np.ndarray, noise: SolidNoise, wavelength: float, shift: float) -> Float[np.ndarray, "v 3"]:
-    """Return a smooth random vector field."""
     return np.stack([noise(points + shift + 3.7 * axis * wavelength, wavelength) for axis in range(3)], -1)
 
 

@@ -136,7 +136,6 @@ def _paint_eyes(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
 
 
 def _paint_mouth(canvas: _Canvas, rows: np.ndarray) -> np.ndarray:
-    """Paint teeth, and everything else inside the mouth."""
     subject, posed = canvas.subject, canvas.posed
     attributes = np.concatenate([posed.normals, posed.head, subject.anatomy.vertices], -1)
     values = canvas.interpolate(rows, attributes, _model_faces(canvas))
@@ -225,8 +224,7 @@ def develop(
     # Linear up to 0.6, then compressed so that 1.6 is still below white.
     bright = np.maximum(full - 0.6, 0)
     full = np.minimum(full, 0.6) + 0.4 * (1 - np.exp(-bright / 0.4))
-    index = np.clip(full * (_TABLE_SIZE - 1), 0, _TABLE_SIZE - 1).astype(np.int32)
-    return _SRGB_TABLE[index]
+    return _SRGB_TABLE[np.clip(full * (_TABLE_SIZE - 1), 0, _TABLE_SIZE - 1).astype(np.int32)]
 
 
 _TABLE_SIZE = 1 << 16

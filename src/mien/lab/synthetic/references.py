@@ -95,7 +95,6 @@ def reference_named(name: str) -> ReferenceCapture:
 def _reference(
     name: str, sequences: list[dict[str, Any]], views: dict[str, Any] | None = None, **own: Any
 ) -> ReferenceCapture:
-    """A reference capture from its entry in people.toml."""
     recipes = tuple(_recipe({"name": name, **one}) for one in sequences)
     named: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return ReferenceCapture(name, sequences=recipes, views=SideViews(**views) if views else None, **named)

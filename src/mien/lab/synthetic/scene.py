@@ -40,14 +40,10 @@ class SyntheticScene:
     """A person in motion in front of a camera. Recipe and seeds decide everything."""
 
     def __init__(
-        self,
-        recipe: SyntheticRecipe,
-        seed: int,
-        motion_seed: int | None = None,
-        same_person: "SyntheticScene | None" = None,
-        moments: Sequence[int] | None = None,
+        self, recipe: SyntheticRecipe, seed: int, motion_seed: int | None = None,
+        same_person: "SyntheticScene | None" = None, moments: Sequence[int] | None = None,
         faces: Sequence[Mapping[str, float]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Prepare a scene; nothing is drawn yet.
 
         `seed` decides the person, the light and the room, `motion_seed` the motion; None for `seed`. A scene with the
@@ -202,8 +198,7 @@ def _place_cameras(recipe: SyntheticRecipe) -> tuple[Camera, ...]:
     """
     focal = recipe.focal * recipe.width
     K = torch.tensor([[focal, 0, recipe.width / 2], [0, focal, recipe.height / 2], [0, 0, 1.0]])
-    front = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    viewmats = [front]
+    viewmats = [torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))]
     target = torch.tensor([0.0, 0.0, -recipe.distance])
     for index, name in enumerate(recipe.camera_ids[1:], 1):
         share = (index - 1) / max(len(recipe.camera_ids) - 2, 1)

@@ -213,11 +213,9 @@ def turn_light(lighting: Lighting, R_world_head: Float[np.ndarray, "3 3"]) -> Lo
 
 
 def shade_highlights(
-    normals: Float[np.ndarray, "n 3"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
+    normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], light: LocalLight,
     lobes: tuple[tuple[float, float], ...],
-) -> Float[np.ndarray, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Return the specular part of the lamps' light.
 
     Each lobe has a weight and a sharpness. It is normalised, so that a sharper lobe is brighter and smaller.
@@ -235,12 +233,9 @@ def shade_highlights(
 
 
 def shade_skin(
-    channels: Float[np.ndarray, "n 7"],
-    normals: Float[np.ndarray, "n 3"],
-    shadow: Float[np.ndarray, "n 3"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
-) -> Float[np.ndarray, "n 3"]:
+    channels: Float[np.ndarray, "n 7"], normals: Float[np.ndarray, "n 3"], shadow: Float[np.ndarray, "n 3"],
+    views: Float[np.ndarray, "n 3"], light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade skin: diffuse light that bleeds red into shadows, and an oily sheen."""
     albedo, gradient, gloss = channels[:, :3], channels[:, 3:6], channels[:, 6:7]
     normals = unit(unit(normals) - gradient)
@@ -256,8 +251,7 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
     n, s = strands.widths.shape
     room = light.irradiance(np.ascontiguousarray(outwards.reshape(-1, 3))).reshape(n, s, 3)
     colors = 0.75 * strands.colors * room
-    views = unit(viewpoint - strands.points)
-    along_view = dot(tangents, views)
+    along_view = dot(tangents, unit(viewpoint - strands.points))
     across_view = np.sqrt(np.maximum(1 - along_view**2, 0))
     relative = strands.colors / (strands.colors.max(-1, keepdims=True) + 1e-6)
     depth = np.clip(strands.colors.max(-1) / strands.colors.max(), 0, 1)  # hair under other hair is darker
@@ -275,14 +269,10 @@ def shade_hair(strands: Strands, light: LocalLight, viewpoint: Float[np.ndarray,
 
 
 def shade_eye(
-    local: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    axis: Float[np.ndarray, " 3"],
-    under_lid: Float[np.ndarray, " n"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
+    local: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, " 3"],
+    under_lid: Float[np.ndarray, " n"], views: Float[np.ndarray, "n 3"], light: LocalLight,
     iris: tuple[float, np.ndarray, bool],
-) -> Float[np.ndarray, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade an eye: white with veins towards the corners; iris with fibres, limbal ring and pupil; a wet cornea.
 
     `local` are directions from the eyeball's centre, +z along the line of sight; `normals` the same and `axis` the line
@@ -309,8 +299,7 @@ def shade_eye(
     shadow = (0.30 + 0.70 * smoothstep(-0.0005, 0.0045, under_lid))[:, None]
     # Light through the cornea reaches the far side of the iris, so its diffuse light is like that of a bowl.
     outward = normals - along(normals, axis)[:, None] * axis
-    bowl = unit(normals - 1.2 * share * outward)
-    diffuse = albedo * light.irradiance(bowl.astype(np.float32)) * shadow
+    diffuse = albedo * light.irradiance(unit(normals - 1.2 * share * outward).astype(np.float32)) * shadow
     if not is_wet:
         return diffuse
     cornea = unit(normals + 0.75 * outward * smoothstep(1.25, 0.9, q)[:, None])
@@ -326,12 +315,9 @@ def _fibres(turn: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def shade_teeth(
-    rest: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    views: Float[np.ndarray, "n 3"],
-    light: LocalLight,
-) -> Float[np.ndarray, "n 3"]:
+    rest: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"],
+    views: Float[np.ndarray, "n 3"], light: LocalLight,
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade teeth: off-white, with a gap every 8 mm along the arch.
 
     `depth` is the distance behind the foremost tooth in metres; deeper teeth get less light.
@@ -351,11 +337,9 @@ def shade_teeth(
 
 
 def shade_mouth(
-    normals: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    views: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"], views: Float[np.ndarray, "n 3"],
     light: LocalLight,
-) -> Float[np.ndarray, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:  # fmt: skip
     """Shade the mouth as wet dark flesh: gums, tongue, the inside of the cheeks."""
     scarce = np.exp(-np.clip(depth - 0.006, 0, None) / 0.012)[:, None]
     albedo = np.array([0.34, 0.085, 0.075], np.float32)

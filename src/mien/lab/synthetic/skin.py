@@ -93,14 +93,9 @@ def _canvas(anatomy: Anatomy, uv: np.ndarray, size: int) -> tuple[_Canvas, np.nd
     points = values[covered]
     n = len(points)
     canvas = _Canvas(
-        covered=covered,
-        points=np.ascontiguousarray(points[:, :3]),
-        ears=points[:, 3],
-        neck=points[:, 4],
-        height=np.zeros(n, np.float32),
-        albedo=np.zeros((n, 3), np.float32),
-        gloss=np.ones(n, np.float32),
-    )
+        covered=covered, points=np.ascontiguousarray(points[:, :3]), ears=points[:, 3], neck=points[:, 4],
+        height=np.zeros(n, np.float32), albedo=np.zeros((n, 3), np.float32), gloss=np.ones(n, np.float32),
+    )  # fmt: skip
     return canvas, values[..., :3]
 
 
@@ -164,8 +159,7 @@ def _paint_eyes(canvas: _Canvas, anatomy: Anatomy, view: FrontView) -> None:
     in_front = smoothstep(anatomy.landmarks[33, 2] - 0.02, anatomy.landmarks[33, 2] - 0.01, points[:, 2])
     for side in SIDES:
         upper, lower = anatomy.curve(places.UPPER_LIDS[side], 40), anatomy.curve(places.LOWER_LIDS[side], 40)
-        outline = np.concatenate([upper, lower[::-1]])
-        around = view.look_up(view.polygon(outline, 0.006), points) * in_front
+        around = view.look_up(view.polygon(np.concatenate([upper, lower[::-1]]), 0.006), points) * in_front
         below = view.look_up(view.polygon(lower - [0, 0.007, 0], 0.003), points) * in_front
         under = view.look_up(view.line(lower - [0, 0.008, 0], 0.004, 0.003), points) * in_front
         rim = view.look_up(view.line(lower, 0.0012, 0.0006), points) * in_front

@@ -104,23 +104,12 @@ def build_subject(model: FaceModel, identity: torch.Tensor, recipe: SyntheticRec
     faces, materials = _all_faces(anatomy, kept, hair, glasses, shirt)
     occluders = _occluders(anatomy, scalp, glasses, shirt) if recipe.detail.shadows else None
     return Subject(
-        model=model,
-        poser=HeadPoser(model, identity),
-        anatomy=anatomy,
-        textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color),
-        lighting=studio_lighting(seed),
-        visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders),
-        eyes=eyes,
-        iris_color=_color(random, "iris"),
-        wet_eyes=recipe.detail.wet_eyes,
-        shirt_color=_color(random, "shirt"),
-        hair=tuple(hair),
-        glasses=glasses,
-        shirt=shirt,
-        faces=faces,
-        materials=materials,
-        model_faces=kept,
-    )
+        model=model, poser=HeadPoser(model, identity), anatomy=anatomy,
+        textures=paint_skin(anatomy, recipe, seed, 0.75 * hair_color), lighting=studio_lighting(seed),
+        visibility=compute_visibility(anatomy.vertices, anatomy.normals, occluders), eyes=eyes,
+        iris_color=_color(random, "iris"), wet_eyes=recipe.detail.wet_eyes, shirt_color=_color(random, "shirt"),
+        hair=tuple(hair), glasses=glasses, shirt=shirt, faces=faces, materials=materials, model_faces=kept,
+    )  # fmt: skip
 
 
 def _color(random: np.random.Generator, of: str) -> Float[np.ndarray, " 3"]:
@@ -139,11 +128,9 @@ def pose_subject(subject: Subject, face: FaceParams, camera_position: Float[np.n
     centers = np.stack([head[eye.vertices].mean(0) for eye in subject.eyes])
     pose = HeadPose(head, normals, landmarks, centers, _shoulders(subject, face, R))
     return PosedSubject(
-        **vars(pose),
-        strands=tuple(hair.posed(pose) for hair in subject.hair),
-        R_world_head=R,
+        **vars(pose), strands=tuple(hair.posed(pose) for hair in subject.hair), R_world_head=R,
         viewpoint=exact.rotated(camera_position - T_world_head[:3, 3], R.T),
-    )
+    )  # fmt: skip
 
 
 def opaque_vertices(subject: Subject, posed: PosedSubject) -> Float[np.ndarray, "w 3"]:
@@ -223,12 +210,8 @@ def _occluders(
 
 
 def _all_faces(
-    anatomy: Anatomy,
-    kept: np.ndarray,
-    hair: Sequence[Hair],
-    glasses: Glasses | None,
-    shirt: RigidMesh | None,
-) -> tuple[np.ndarray, np.ndarray]:
+    anatomy: Anatomy, kept: np.ndarray, hair: Sequence[Hair], glasses: Glasses | None, shirt: RigidMesh | None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the triangles over `opaque_vertices` and their materials."""
     of_model = np.full(len(anatomy.faces), int(Material.SKIN))
     of_model[anatomy.region("eyes", "irises")] = Material.EYE

@@ -219,7 +219,6 @@ def shuffled(names: Sequence[str], study: str, participant: str, what: str) -> l
 
 
 def _numbers(text: str) -> Iterator[int]:
-    """Random whole numbers below 2^32."""
     a, b, c = (_hash(f"{salt}{text}") for salt in "012")
     count = 1
     for index in range(1 << 62):

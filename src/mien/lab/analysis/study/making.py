@@ -100,8 +100,7 @@ def _pieces(index: int, workspace: StudyRuns, seconds: float) -> list[Clip]:
         places.setdefault((sequence, camera_id), []).append(timestep)
     found = []
     for (sequence, camera_id), timesteps in places.items():
-        most = max(2, round(seconds * rates[sequence]))
-        for first, count in spans(timesteps, most):
+        for first, count in spans(timesteps, max(2, round(seconds * rates[sequence]))):
             found.append(Clip(index, sequence, camera_id, first, count, rates[sequence]))
     longest = max((clip.timesteps for clip in found), default=0)
     if longest == 0:

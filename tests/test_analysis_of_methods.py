@@ -1,4 +1,4 @@
-"""`mien analyze headgas`: every part runs and writes its files; what parts choose and draw is as they say."""
+"""`mien analyze headgas` and `mono-gaussian-avatar`: parts write their files; what they choose is as they say."""
 
 import json
 import math
@@ -14,11 +14,12 @@ import torch
 
 import train_toy
 from capture_helpers import tree_bytes
+from mien.avatar import Avatar, load_avatar
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.settings import GradientSettings, PerceptualLoss, Photometric
 from mien.cli import main
 from mien.gaussians import Gaussians
-from mien.lab.analysis import headgas
+from mien.lab.analysis import headgas, measuring, mono_gaussian_avatar
 from mien.lab.analysis.headgas import Trained, busy_face, start_of_bases, trained_range, with_expression
 from mien.lab.analysis.joining import joined_rows
 from mien.lab.analysis.measuring import head_camera, mouth_camera
@@ -26,7 +27,10 @@ from mien.lab.analysis.registry import AnalysisOptions
 from mien.lab.analysis.running import Context
 from mien.media.video import count_frames
 from mien.runtime.filmed import head_angles
+from mien.training import TrainSettings
+from mien.training.footage.frames import training_frames
 from mien.training.run import read_face_track
+from plain_settings import plain_mono_gaussian_avatar
 from shared_things import MadeOnce, write_toy_workspace
 from toy_scene import toy_camera, toy_face, toy_face_model, toy_sequence
 
@@ -58,14 +62,14 @@ def context(toy: Path, tmp_path: Path) -> Context:
     return Context(toy / "runs/toy", (toy / "sequences/clip",), torch.zeros(()), tmp_path, AnalysisOptions())
 
 
-def analyze(root: Path, *more: str) -> dict[str, Any]:
-    assert main(["analyze", "headgas", str(root), *more]) == 0
+def analyze(method: str, root: Path, *more: str) -> dict[str, Any]:
+    assert main(["analyze", method, str(root), *more]) == 0
     return json.loads((root / "analysis/toy/analysis.json").read_text())["parts"]
 
 
 def test_parts_without_training_write_pictures_and_films(workspace: Path) -> None:
     before = tree_bytes(workspace)
-    parts = analyze(workspace, "--seconds", "0.01")
+    parts = analyze("headgas", workspace, "--seconds", "0.01")
     assert list(parts) == ["basis", "layers", "beyond", "sizes"]
     folder = workspace / "analysis/toy"
     assert {entry["file"] for part in parts.values() for entry in part["films"]} == set(FILMS)
@@ -105,10 +109,10 @@ def test_several_subjects_are_joined_to_statistics(toy: Path, tmp_path: Path, ca
 def test_the_ablations_are_trained_and_timed_alike(
     workspace: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    timed, measure = [], headgas.measure_drawing
-    monkeypatch.setattr(headgas, "measure_drawing", lambda *args: timed.append(args[0].training) or measure(*args))
+    timed, measure = [], measuring.measure_drawing
+    monkeypatch.setattr(measuring, "measure_drawing", lambda *args: timed.append(args[0].training) or measure(*args))
     asked = ("--parts", "ablations", "--steps", "6", "--seconds", "0.01")
-    part = analyze(workspace, *asked)["ablations"]
+    part = analyze("headgas", workspace, *asked)["ablations"]
     assert "ablations: 5 trainings of 6 steps each" in capsys.readouterr().err
     rows = part["values"]["rows"]
     assert [row["name"] for row in rows] == ["no_blending", "change_all", "delta", "no_mlp", "full"]
@@ -119,13 +123,13 @@ def test_the_ablations_are_trained_and_timed_alike(
     assert runs == [f"ablation-{name}" for name in ("change-all", "delta", "full", "no-blending", "no-mlp")]
     assert part["tables"][0]["rows"][-1][-3:] == [28_000, 4.0, 32.5]
     assert (workspace / "analysis/toy/ablations.png").is_file()
-    assert analyze(workspace, *asked)["ablations"] == part
-    assert list(analyze(workspace, *asked, "--widen")["ablations"]["values"]["widths"])[:2] == ["8", "16"]
+    assert analyze("headgas", workspace, *asked)["ablations"] == part
+    assert list(analyze("headgas", workspace, *asked, "--widen")["ablations"]["values"]["widths"])[:2] == ["8", "16"]
 
 
 def test_ablations_and_sizes_on_a_device(workspace: Path, elsewhere: set[str]) -> None:
     asked = ("--parts", "sizes", "ablations", "--steps", "2", "--seconds", "0.01", "--device", "auto")
-    rows = analyze(workspace, *asked)["ablations"]["values"]["rows"]
+    rows = analyze("headgas", workspace, *asked)["ablations"]["values"]["rows"]
     assert all(row["frame_ms"] > 0 and row["head_psnr"] > 0 for row in rows)
     assert "float64" in elsewhere
 
@@ -148,7 +152,7 @@ def test_rows_differ_only_in_what_they_say() -> None:
 
 def test_the_network_without_blending_widens_to_a_plateau(monkeypatch: pytest.MonkeyPatch) -> None:
     scores: dict[int, float | None] = {8: 20.0, 16: 20.5, 32: 20.55, 64: 30.0}
-    monkeypatch.setattr(headgas, "held_out_scores", lambda width, metric: {"head_psnr": scores[width]})
+    monkeypatch.setattr(measuring, "held_out_scores", lambda width, metric: {"head_psnr": scores[width]})
     context: Any = SimpleNamespace(train=lambda name, config: config.hidden)
     first: Any = 8
     assert headgas.widened(context, CONFIG, first) == (16, {8: 20.0, 16: 20.5, 32: 20.55})
@@ -173,14 +177,13 @@ def test_the_mouth_is_that_of_a_frontal_frame_with_shut_lips(context: Context, m
     marks[:, 0, 263, 0], marks[:, 0, 14, 1], turns[3, 1] = 10.0, 4.0, 0.5
     assert headgas.shut_lips([replace(sequence, capture=replace(sequence.capture, landmarks=0 * marks))]) is None
     marks[[3, 7], 0, 14, 1], marks[9, 0, 13:15], marks[11, 0, 263] = 0.1, np.nan, 0.0
-    face = replace(sequence.tracking.face, head_rotation=turns)
-    changed = replace(sequence.tracking, face=face)
+    changed = replace(sequence.tracking, face=replace(sequence.tracking.face, head_rotation=turns))
     found = replace(sequence, capture=replace(sequence.capture, landmarks=marks), tracking=changed)
     assert headgas.shut_lips([sequence, found]) == (1, 7), "of 3 and 7, it is the one that is not turned"
     (own,) = context.sequences
     vars(context)["sequences"] = [replace(own, capture=replace(own.capture, landmarks=marks[5:10]))]
-    drawn, draw = [], headgas.draw_avatar
-    monkeypatch.setattr(headgas, "draw_avatar", lambda *given: drawn.append(given[1]) or draw(*given))
+    drawn, draw = [], measuring.draw_avatar
+    monkeypatch.setattr(measuring, "draw_avatar", lambda *given: drawn.append(given[1]) or draw(*given))
     picture = headgas.layers(context).pictures[1]
     assert "The mouth in clip, timestep 2, whose lips are shut" in picture.caption
     wanted = read_face_track(context.run_dir, context.avatar.face_model)[2]
@@ -224,3 +227,123 @@ def test_the_camera_goes_where_the_head_sees_it_at_an_angle(context: Context) ->
     pixels, _ = camera.project(model(face)[0])
     assert 0 < float(pixels.min()) < float(pixels.max()) < 100
     assert mouth_camera(model, face, toy_camera(64), 50).K[0, 0] < 0.6 * camera.K[0, 0]
+
+
+MONO = plain_mono_gaussian_avatar(points=60, max_points=120, epochs=10)
+
+
+@pytest.fixture
+def mono_toy(made_once: MadeOnce) -> Path:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(train_toy, "CONFIG", MONO)
+        return made_once("analysis_mono", write_toy_workspace)
+
+
+@pytest.fixture
+def mono_workspace(mono_toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(mono_gaussian_avatar, "SIDE", 16)
+    return Path(shutil.copytree(mono_toy, tmp_path / "W"))
+
+
+def test_times_stand_beside_the_papers(mono_workspace: Path) -> None:
+    part = analyze("mono-gaussian-avatar", mono_workspace, "--seconds", "0.01")
+    assert list(part) == ["times"]
+    times, rows = part["times"]["values"]["frame_ms"], part["times"]["tables"][0]["rows"]
+    assert {name: value > 0 for name, value in times.items()} == {"networks": True, "baked": True}
+    assert rows[-1][:3] == ["paper: MonoGaussianAvatar", 9.0, 30.0]
+    assert rows[-4][:3] == ["paper: NeRFace", 48.0, 2000.0]
+
+
+@pytest.mark.slow
+def test_short_trainings_write_their_pictures(mono_workspace: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    # As in the paper: 0.0025 m from the middle between 512 and 1024 pixels on, which is at 724.
+    assert [mono_gaussian_avatar.scale_gain(side) for side in (128, 512, 720, 730, 1024, 2048)] == 3 * [0.00625] + 3 * [
+        0.0025
+    ]
+    monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {16: 0.004, 32: 0.00625})
+    asked = ("--parts", "convergence", "resolutions", "diversity", "--steps", "10")
+    parts = analyze("mono-gaussian-avatar", mono_workspace, *asked)
+    assert "diversity: 5 trainings of 10 steps each" in capsys.readouterr().err
+    files = ("convergence.png", "convergence-psnr.svg", "convergence-points.svg", "resolutions.png", "diversity.png")
+    assert all((mono_workspace / "analysis/toy" / name).is_file() for name in files)
+    shown, sides, subsets = (parts[name]["values"]["rows"] for name in ("convergence", "resolutions", "diversity"))
+    assert [row["step"] for row in shown] == [1, 2, 5, 10]
+    assert [(row["side"], row["scale_gain"]) for row in sides] == [(32, 0.00625), (16, 0.004)]
+    runs = (mono_workspace / "analysis/toy/runs").glob("resolution-*")
+    gains = {one.name.split("-")[1]: load_avatar(one).config.scale_gain for one in runs}  # type: ignore[attr-defined]
+    assert gains == {"16": 0.004, "32": 0.00625}
+    clips = [("frontal clip", 1), ("mixed clip", 2)]
+    wanted = [("all frames", 4), *clips, ("frontal quarter", 1), ("mixed half", 2)]
+    assert [(row["name"], row["timesteps"]) for row in subsets] == wanted
+    assert [len({row["head_psnr"] for row in rows}) for rows in (shown, sides)] == [4, 2]
+    assert subsets[0]["head_psnr"] == sides[0]["head_psnr"], "all frames at full size is the same training in both"
+    assert analyze("mono-gaussian-avatar", mono_workspace, *asked) == parts
+    # A capture with more pixels than the paper's is trained at the paper's two sizes.
+    monkeypatch.setattr(mono_gaussian_avatar, "GAINS", {16: 0.004, 24: 0.00625})
+    shutil.rmtree(mono_workspace / "analysis")
+    again = analyze("mono-gaussian-avatar", mono_workspace, "--parts", "resolutions", "--steps", "2")
+    sides = again["resolutions"]["values"]["rows"]
+    assert [(row["side"], row["scale_gain"]) for row in sides] == [(24, 0.00625), (16, 0.004)]
+
+
+@pytest.mark.slow
+def test_convergence_trains_as_the_run_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With steps before the first picture, as the presets `draft` and `standard` have them."""
+    monkeypatch.setattr(train_toy, "CONFIG", plain_mono_gaussian_avatar(points=60, max_points=120, pretraining=7))
+    write_toy_workspace(tmp_path / "W")
+    seen: list[dict[str, torch.Tensor]] = []
+
+    def drawn(avatar: Avatar, *_: Any) -> torch.Tensor:
+        seen.append({name: tensor.clone() for name, tensor in avatar.state_dict().items()})
+        return torch.full((32, 32, 3), 0.5)
+
+    monkeypatch.setattr(mono_gaussian_avatar, "drawn", drawn)
+    analyze("mono-gaussian-avatar", tmp_path / "W", "--parts", "convergence", "--steps", str(train_toy.SETTINGS.steps))
+    trained = load_avatar(tmp_path / "W" / "runs" / "toy").state_dict()
+    assert trained.keys() == seen[-1].keys()
+    for name, tensor in trained.items():
+        assert torch.equal(tensor, seen[-1][name]), name
+
+
+def test_times_and_stages_on_a_device(mono_workspace: Path, elsewhere: set[str]) -> None:
+    asked = ("--parts", "times", "convergence", "--steps", "2", "--seconds", "0.01", "--device", "auto")
+    parts = analyze("mono-gaussian-avatar", mono_workspace, *asked)
+    assert parts["convergence"]["values"]["rows"][-1]["head_psnr"] > 0
+    assert "float64" in elsewhere
+
+
+def measured(angles: np.ndarray, expressions: np.ndarray) -> mono_gaussian_avatar.Measured:
+    return mono_gaussian_avatar.Measured(tuple((0, index) for index in range(len(angles))), angles, expressions)
+
+
+def test_the_mixed_half_keeps_what_is_rare() -> None:
+    angles, expressions = np.zeros((22, 2)), np.zeros((22, 3))
+    angles[20, 0], expressions[21, 1] = 1.0, 4.0
+    whole = measured(angles, expressions)
+    chosen = mono_gaussian_avatar.mixed_half(whole)
+    assert len(chosen) == len(set(chosen)) == 11
+    assert {20, 21} <= set(chosen)
+    assert (
+        mono_gaussian_avatar.ranges(whole, chosen)["yaw_range"]
+        > mono_gaussian_avatar.ranges(whole, list(range(20)))["yaw_range"]
+        == 0
+    )
+    # Subsets are chosen among the frames of the training.
+    _, sequence = toy_sequence(10, 32)
+    frames = training_frames([sequence], TrainSettings(split="tail"))
+    found = mono_gaussian_avatar.measure([sequence], frames)
+    assert found.timesteps == tuple((0, index) for index in range(8))
+    assert found.expressions.std(0)[sequence.tracking.face.expression[:8].std(0).numpy() > 0] == pytest.approx(1)
+    (mask,) = mono_gaussian_avatar.masks([sequence], found, [0, 3])
+    assert mask.nonzero()[:, 0].tolist() == [0, 3]
+    assert mono_gaussian_avatar.ranges(found, list(range(8)))["expression_spread"] == pytest.approx(1)
+
+
+def test_the_frontal_quarter_has_the_views_nearest_to_the_median():
+    yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
+    whole = measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))
+    assert mono_gaussian_avatar.frontal_quarter(whole) == [3, 7]
+    # Clips are successive timesteps, whatever lies between the best ones.
+    assert mono_gaussian_avatar.clip(whole, 0.25, mixed=False) == [3, 4]
+    assert mono_gaussian_avatar.clip(whole, 0.5, mixed=True) == [0, 1, 2, 3]
+    assert mono_gaussian_avatar.clip(whole, 0.25, mixed=True) == [5, 6]
