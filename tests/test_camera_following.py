@@ -71,7 +71,8 @@ def course(landmarks: np.ndarray) -> Course:
     """Return a follower before which nobody is seen first, and then the clip. After each frame: its state and face."""
     one, states = follower(), []
     for seconds, found in [(-1.0, None), *((index / FPS, each) for index, each in enumerate(landmarks))]:
-        states.append((one.state, one(found, SIZE, SIZE, seconds)))
+        face = one(found, SIZE, SIZE, seconds)
+        states.append((one.state, face))
     return one, states
 
 

@@ -1,6 +1,5 @@
 """The whole avatar in a .glb file: equal arrays and pictures, damage, the validator, and programs of others."""
 
-import base64
 import json
 import math
 from pathlib import Path
@@ -17,9 +16,7 @@ from mien.avatar.methods import METHODS
 from mien.camera import Camera
 from mien.cli import main
 from mien.formats.glb import EXTENSION, MeshModel, read_glb_avatar, write_glb
-from mien.formats.page import write_page
 from mien.formats.shared.glb_file import GlbWriter, read_glb
-from mien.formats.shared.packed import pack
 from mien.formats.spz import read_spz
 from mien.formats.vrm import BODY, LICENCE, write_vrm
 from mien.render import rasterize
@@ -61,7 +58,7 @@ def rewritten(source: Path, path: Path, edit: Any) -> Path:
 @pytest.mark.unchecked
 @pytest.mark.parametrize("method", METHODS)
 def test_the_whole_avatar_comes_back(method: str, tmp_path: Path) -> None:
-    """The .mien files of both avatars have the same bytes, so all arrays are equal. A page holds it, too.
+    """The .mien files of both avatars have the same bytes, so all arrays are equal.
     Besides KHR_gaussian_splatting, which it does not know yet, the validator only notes the extension and its views."""
     path, portable = written(method, tmp_path)
     read = read_glb_avatar(path)
@@ -71,8 +68,6 @@ def test_the_whole_avatar_comes_back(method: str, tmp_path: Path) -> None:
     for name, avatar in (("a.mien", portable), ("b.mien", read)):
         runtime.write_portable(tmp_path / name, avatar)
     assert (tmp_path / "a.mien").read_bytes() == (tmp_path / "b.mien").read_bytes()
-    assert write_page(tmp_path / "a.html", read).psnr >= 45
-    assert base64.b64encode(pack(portable)).decode() in (tmp_path / "a.html").read_text(encoding="utf-8")
     expect_valid(path)
 
 
@@ -119,10 +114,8 @@ def test_foreign_and_damaged_files_are_refused(glb: Path, tmp_path: Path) -> Non
         for edit in edits:
             rewritten(glb, path, edit)
             refuses(told, read_glb_avatar, path)
-    whole = glb.read_bytes()
-    for damaged in (b"", b"glTF", whole[:1000], b"x" + whole[1:], whole[:20] + b"[" + whole[21:], whole + b"1"):
-        path.write_bytes(damaged)
-        refuses(r"a\.glb: is damaged, or not a \.glb file", read_glb_avatar, path)
+    path.write_bytes(b"glTF is not here")
+    refuses("is damaged, or not a .glb file", read_glb_avatar, path)
 
 
 WIDE = 256

@@ -1,5 +1,6 @@
 """Every method keeps the promises of the interface on a toy scene, and rows of Gaussians keep their moments."""
 
+import base64
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +15,16 @@ from known import known
 from mien import runtime
 from mien.avatar import Avatar, load_avatar
 from mien.avatar.avatar import ParameterGroup
-from mien.avatar.baking import make_portable
+from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import write_avatar
 from mien.avatar.headgas.settings import HeadGasConfig, Variant
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.avatar.settings import GradientSettings, MethodConfig, PerceptualLoss, Photometric, Progress
 from mien.avatar.store import GaussianStore, Moments
 from mien.face import FaceModel
+from mien.formats.glb import MeshModel, read_glb_avatar, write_glb
+from mien.formats.page import write_page
+from mien.formats.shared.packed import pack
 from mien.render import rasterize
 from mien.training import TrainSettings
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
@@ -149,6 +153,22 @@ def test_baked_avatar_poses_as_the_avatar_does(method: str, tmp_path: Path) -> N
             np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-4, err_msg=name)
         picture = rasterize(truth, toy_camera(SIZE), torch.ones(3)).image.detach().numpy()
         np.testing.assert_allclose(portable.render(found)[0], picture, atol=1e-3, rtol=0)
+
+
+@pytest.mark.unchecked
+@pytest.mark.parametrize("method", METHODS)
+def test_an_avatar_becomes_a_file_a_page_and_a_mesh(method: str, tmp_path: Path) -> None:
+    avatar = new_avatar(method)
+    portable, model = make_portable(avatar, toy_camera(64), "toy"), avatar.face_model
+    runtime.write_portable(tmp_path / "a.mien", portable)
+    mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
+    write_glb(tmp_path / "a.glb", runtime.read_portable(tmp_path / "a.mien"), mesh, 32)
+    read = read_glb_avatar(tmp_path / "a.glb")
+    assert read.about.method == method
+    runtime.write_portable(tmp_path / "b.mien", read)
+    assert (tmp_path / "b.mien").read_bytes() == (tmp_path / "a.mien").read_bytes()
+    assert write_page(tmp_path / "a.html", read).psnr >= 45
+    assert base64.b64encode(pack(portable)).decode() in (tmp_path / "a.html").read_text(encoding="utf-8")
 
 
 @each
