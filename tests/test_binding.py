@@ -157,23 +157,6 @@ def test_the_optimiser_knows_gradients_in_the_new_frames() -> None:
         torch.testing.assert_close(*squares, atol=1e-5, rtol=1e-3)
 
 
-def test_changes_fade_where_colors_are_doubted() -> None:
-    avatar = toy_avatar()
-    store, count = avatar.store, len(avatar.face_model.faces)
-    doubt, none = torch.zeros(count), torch.zeros(count, dtype=torch.bool)
-    doubt[:3] = torch.tensor([1.0, 0.1, 0.02])
-    for name in ("offset_basis", "feature_bases"):
-        torch.nn.init.ones_(store[name])
-    prior = SurfacePrior(torch.zeros(count), colors=torch.full((count, 3), 0.5), doubt=doubt, filled_in=none)
-    surface_of(avatar).fade_changes(prior, 100)
-    for name in ("offset_basis", "feature_bases"):
-        own = store[name].flatten(1)
-        torch.testing.assert_close(own, own[:, :1].expand_as(own))
-        expected = torch.ones(count)
-        expected[:3] = torch.tensor([0.95**100, 0.995**100, 0.999**100])
-        torch.testing.assert_close(own[:, 0], expected, atol=1e-5, rtol=1e-3)
-
-
 def test_shifts_that_undo_the_motion_of_the_mesh_are_seen() -> None:
     avatar = toy_avatar()
     surface, model = surface_of(avatar), avatar.face_model

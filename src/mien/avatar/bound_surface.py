@@ -168,22 +168,6 @@ class BoundSurface:
         self._binding_of(prior).renew(store, self._limits_and_pulls(prior)[0], shifts, store.moments)
 
     @torch.no_grad()
-    def fade_changes(self, prior: SurfacePrior, steps: int) -> None:
-        """Take changes with the face away in so many steps as colours are pulled, where colours are doubted.
-
-        Light that leaks through skin teaches them: a mouth that was never open had green teeth.
-        """
-        pulls = self._limits_and_pulls(prior)[1]
-        if pulls is None:
-            return
-        store, shares = self._store, pulls[self.triangles().long(), 3]
-        rows = shares.nonzero()[:, 0]
-        kept = (1 - shares[rows]) ** steps
-        for name in self._bases:
-            if name in store.trained:
-                store[name].detach()[rows] *= kept.view(-1, *[1] * (store[name].ndim - 1))
-
-    @torch.no_grad()
     def counter_motion(
         self, posed: Items[tuple[Float[Tensor, "v 3"], Mapping[str, Tensor]]]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:

@@ -120,11 +120,10 @@ class WholeHead:
             self.unseen.mask_gradients(self._avatar, self._surface, *renderings)
 
     def after_update(self, progress: Progress) -> None:
-        """Bring Gaussians back to the surface. At times, bind them to what they lie on, and fade doubtful changes."""
+        """Bring Gaussians back to the surface. At times, bind them to what they lie on."""
         if self.unseen is not None:
             if progress.reaches(_BOUND_EVERY) and progress.done < progress.steps:
                 self._surface.renew_binding(self.unseen.prior)
-                self._surface.fade_changes(self.unseen.prior, _BOUND_EVERY)
             self._surface.keep_to(self.unseen.prior)
 
     def move_hair(self, progress: Progress) -> None:
