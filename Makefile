@@ -96,7 +96,7 @@ test-long: setup web-packages chromium batch-engines
 	MIEN_SEED=$(SEED) MIEN_THREADS=1 $(BIN)/pytest -n auto -m long
 
 # A broad and fast part of the suite on Python 3.12, in an environment of its own. All of it: make test VENV=.venv312 PYTHON=python3.12
-PART := terminal startup cli inside rasterize training_native training_resume runtime export motion
+PART := terminal startup cli inside rasterize training_native training_batch runtime export motion
 test-312:
 	@if "$(PYTHON312)" -c "" 2>/dev/null; then $(MAKE) VENV=.venv312 PYTHON="$(PYTHON312)" test-312-part; \
 	else echo "No Python 3.12: skipped. Install it, or run 'make PYTHON312=/path/to/python3.12 test-312'."; $(UNLESS_STRICT); fi
