@@ -27,7 +27,7 @@ _OPEN_OPACITY = 0.5  # sum of the opacities of a triangle's Gaussians below whic
 _SHIFTS = ("offset_basis",)  # tensors [n, 3, r] of a store that are added to centres
 _UNLIMITED = (-1e4, 1e4, 10.0, 10.0, 1.0)
 """Limits of what is rigid, in the order of `limits_of_triangles`."""
-_LEAST_MOTION = 3e-4  # motion of a triangle, in metres, below which nothing says what undoes it
+LEAST_MOTION = 3e-4  # motion of a triangle, in metres, below which nothing says what undoes it
 _COLOR_PULL = 0.05
 """Share of the difference to the completed colour that a step takes away where no picture shows a triangle. Measured: a
 tenth of it has 0.5 dB less in front (log, 11-23)."""
@@ -187,7 +187,7 @@ class BoundSurface:
         by_mesh, by_shifts = (torch.stack(own) - torch.stack(own).mean(0) for own in (motion, undone))
         squares = by_mesh.square().sum(2).mean(0)
         products = (by_mesh * by_shifts).sum(2).mean(0)
-        return -products / squares.clamp_min(_LEAST_MOTION**2), squares.sqrt()
+        return -products / squares.clamp_min(LEAST_MOTION**2), squares.sqrt()
 
     @torch.no_grad()
     def carry(self, rows: Int[Tensor, " k"], prior: SurfacePrior) -> Bool[Tensor, " n"]:
@@ -215,7 +215,7 @@ class BoundSurface:
         return lost
 
     def _binding_of(self, prior: SurfacePrior) -> Binding:
-        """Which triangles lie beside each other and are filled, closed or trained alike. The carrier is for itself."""
+        """Return which triangles are beside each other and filled, closed or trained alike. The carrier is for itself."""
         if self._binding is None:
             vertices, faces = self._mesh()
             kinds = torch.zeros(len(faces), dtype=torch.long, device=faces.device)

@@ -21,7 +21,7 @@ from mien.machine.terminal import show
 
 _STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
 _NOT_A_NUMBER = re.compile(r"Error parsing (--\S+): [^;]*?(int|float)\b[^;]*: ('[^']*')")
-"""What Python says of a text that is no number, after tyro's words."""
+"""Matches what tyro and Python say of a text that is no number."""
 _FIRST = {
     "create": ("out", "name", "preset", "method", "device", "view"),
     "render": ("out", "run", "set", "path", "motion", "yaw", "size", "background"),

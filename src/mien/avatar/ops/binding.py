@@ -25,7 +25,7 @@ _FACING = 0.5
 
 
 class Binding:
-    """Which triangle of a person's neutral head a Gaussian lies on.
+    """The triangles of a person's neutral head, which finds the one that a Gaussian lies on.
 
     Args:
         vertices: The vertices of the neutral head, in metres.

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
-from mien.avatar.bound_surface import BoundSurface
+from mien.avatar.bound_surface import LEAST_MOTION, BoundSurface
 from mien.avatar.ops.regions import vertex_motions
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
@@ -26,7 +26,6 @@ _UNDONE = 0.2
 all but 18 Gaussians above the neck; of drawn glasses, 640 are above (log, 11-30)."""
 _NEAREST = 16  # number of Gaussians around each, itself included, that the share is a mean over
 _LEAST_COUNT = 50  # smallest number of Gaussians that make a rigid part
-_LEAST_MOTION = 3e-4  # motion with the expression, in metres, from which a Gaussian is looked at
 _STILL = 1e-6  # largest motion of a vertex, in metres per unit of an input, that counts as none
 
 
@@ -59,7 +58,7 @@ def rigid_gaussians(
     posed = [(model.head_vertices(face)[0], avatar.pose(face).aux) for face in faces]
     undone, motion = surface.counter_motion(posed)
     left = kept | head_parts(model).neck.to(kept.device)
-    looked = ((motion > _LEAST_MOTION) & ~left[surface.triangles().long()]).nonzero()[:, 0]
+    looked = ((motion > LEAST_MOTION) & ~left[surface.triangles().long()]).nonzero()[:, 0]
     if len(looked) < max(_NEAREST, _LEAST_COUNT):
         return looked[:0]
     places = world_means(avatar.pose(still).gaussians)[0][looked].cpu().numpy()
