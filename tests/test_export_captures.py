@@ -207,7 +207,7 @@ def near(folder: Path, name: str, picture: np.ndarray) -> bool:
 
 
 def test_nerf_blendshape_is_read_back(folders: dict[str, Path], single: Sequence, scene: Scene) -> None:
-    """What is held out comes last; a picture has its head, its parsing and its landmarks by its number."""
+    """Held-out frames come last; a picture has its head, its parsing and its landmarks by its number."""
     folder, order, content = folders["nerf-blendshape"], (*TRAINED, *HELD_OUT), filmed(single, scene)
     (sequence,) = read(folder, "nerf-blendshape", scene.model)
     for number, timestep in enumerate(order):

@@ -305,7 +305,7 @@ ODDITIES: dict[str, dict[str, list[float] | float]] = {
     "on the camera": {"means": [0.0, 0.0, 0.0]}, "touching the camera": {"means": [0.0, 0.0, 0.0101]},
     "far outside": {"means": [50.0, 0.0, 0.3]}, "far away": {"means": [0.0, 0.0, 1e4]},
 }  # fmt: skip
-"""What is odd about a Gaussian. Means are in the camera's frame."""
+"""Names of oddities of a Gaussian. Means are in the camera's frame."""
 
 
 def make_odd(scene: Scene, oddities: list[str]) -> None:

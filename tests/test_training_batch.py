@@ -278,7 +278,7 @@ def test_a_stop_leaves_a_checkpoint_of_its_step(number, kind, tmp_path, undistur
 
 @pytest.mark.unchecked
 def test_time_and_memory_add_up_over_stops(tmp_path: Path) -> None:
-    """What a run sums up over its steps counts the processes before a stop: time, peak memory, records, steps."""
+    """Time, peak memory, records and steps count the processes before a stop."""
     for last in (2, 4):  # the second process takes four steps, up to step 6
         pytest.raises(KeyboardInterrupt, train_until_step, tmp_path, last, interrupt)
     path = checkpoint_files(tmp_path / "checkpoints")[-1]

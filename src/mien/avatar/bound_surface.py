@@ -215,7 +215,7 @@ class BoundSurface:
         return lost
 
     def _binding_of(self, prior: SurfacePrior) -> Binding:
-        """Return which triangles are beside each other and filled, closed or trained alike. The carrier is for itself."""
+        """Find which triangles are beside each other and filled, closed or trained alike. The carrier is alone."""
         if self._binding is None:
             vertices, faces = self._mesh()
             kinds = torch.zeros(len(faces), dtype=torch.long, device=faces.device)

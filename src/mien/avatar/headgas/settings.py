@@ -28,9 +28,9 @@ class HeadGasConfig(MethodConfig):
     """Number of directions of the face along which features change: those of the largest spread over the training
     timesteps. 0: the inputs themselves, as in the paper and always in `no_mlp`. Fewer need less memory and time."""
     activations: Literal["whole", "regions"] = "whole"
-    """What the directions are of: the whole face, as in the paper, or, for each Gaussian, the region of the face where
-    it began, and the head's pose, soon beyond what was filmed no further (`regions`). Ablations, `directions` 0, and an
-    `sh_degree` above 0 always have the whole face."""
+    """The motion that features follow: that of the whole face, as in the paper, or that of the region where a Gaussian
+    began and of the head (`regions`), which ends soon beyond what was filmed. Ablations, `directions` 0, and an
+    `sh_degree` above 0 always follow the whole face."""
     hidden: Annotated[int, Range(1, 4096)] = 64
     """Width of the network's only hidden layer."""
     encoding_bands: Annotated[int, Range(0, 24)] = 4

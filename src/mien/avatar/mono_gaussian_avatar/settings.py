@@ -18,7 +18,7 @@ LENGTH_UNIT = 0.25
 """Unit of length, in metres. The paper's head model is four times life size, and its radii and weights fit that."""
 _WIDTH = Range(1, 1024)
 WeightNorm = Literal["trunks", "code", "paper"]
-"""Which layers of the networks have weight normalisation."""
+"""The layers of the networks that have weight normalisation."""
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def _now(like: Tensor) -> float:
 
 
 def measured_on(row: Mapping[str, Any]) -> str:
-    """What drew the pictures of a row of `measure_drawing`, in words."""
+    """Say what drew the pictures of a row of `measure_drawing`."""
     return f"{counted(row['threads'], 'thread')} of a CPU" if row["threads"] else "a GPU"
 
 
