@@ -1,9 +1,12 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 
 #include <algorithm>
 #include <optional>
+#include <utility>
+#include <vector>
 
 #include "arrays.h"
 #include "expression_change.h"
@@ -13,42 +16,63 @@ using namespace nb::literals;
 
 namespace {
 
-void expression_activations(const In<-1>& inputs, const In<-1>& rest, const In<-1, -1>& directions,
-                            const In<-1, -1>& seen, size_t block, const Out<-1>& out) {
-  const size_t count = inputs.shape(0), rank = out.shape(0);
-  require(rest.shape(0) == count && has_shape(directions, count, rank) && seen.shape(1) == rank,
-          "the arrays do not fit each other");
-  require(block >= 1 && rank % block == 0, "activations must be whole blocks");
-  const nb::gil_scoped_release release;
-  mien::expression_activations(
-      {inputs.data(), static_cast<int64_t>(count), rest.data(), directions.data(), static_cast<int64_t>(rank),
-       static_cast<int64_t>(block), seen.data(), static_cast<int64_t>(seen.shape(0))},
-      out.data());
+template <typename A>
+std::vector<float> copy_of(const A& array) {
+  return {array.data(), array.data() + array.size()};
 }
 
-void head_motion(const In<6>& rest, const In<6>& pose, const Out<6>& out) {
-  mien::head_motion(rest.data(), pose.data(), out.data());
+// Activations [inputs] -> [rank] in blocks.
+mien::ActivationArrays along(const In<-1>& rest, const In<-1, -1>& directions, const In<-1, -1>& seen, size_t block) {
+  const size_t rank = directions.shape(1);
+  require(directions.shape(0) == rest.shape(0) && (seen.shape(0) == 0 || seen.shape(1) == rank),
+          "the arrays do not fit each other");
+  require(block >= 1 && rank >= 1 && rank % block == 0, "activations must be whole blocks");
+  return {copy_of(rest), copy_of(directions), copy_of(seen), static_cast<int64_t>(rank), static_cast<int64_t>(block)};
 }
 
-void blend_regions(const In<-1, -1>& shares, const In<-1, -1>& table, const Out<-1, -1>& out) {
-  require(table.shape(0) == shares.shape(1) && has_shape(out, shares.shape(0), table.shape(1)),
+mien::FaceActivations make_face_activations(const In<-1>& rest, const In<-1, -1>& directions, const In<-1, -1>& seen,
+                                            const std::optional<In<-1, -1>>& shares,
+                                            const std::optional<In<6>>& head_rest,
+                                            const std::optional<In<6, -1>>& head_directions,
+                                            const std::optional<In<-1, -1>>& head_seen) {
+  const size_t regions = shares ? shares->shape(1) : 1;
+  require(regions >= 1 && directions.shape(1) % regions == 0, "every region must have as many activations");
+  mien::FaceActivations face{along(rest, directions, seen, directions.shape(1) / regions), {}, {}, {}};
+  if (shares) face.shares = copy_of(*shares);
+  require(head_rest.has_value() == head_directions.has_value() && head_rest.has_value() == head_seen.has_value(),
           "the arrays do not fit each other");
+  if (!head_rest || head_directions->shape(1) == 0) return face;
+  const size_t rank = head_directions->shape(1);
+  require(head_seen->shape(0) == 0 || head_seen->shape(1) == rank, "the arrays do not fit each other");
+  face.head_rest = copy_of(*head_rest);
+  face.head = {std::vector<float>(6), copy_of(*head_directions), copy_of(*head_seen), static_cast<int64_t>(rank),
+               static_cast<int64_t>(rank)};
+  return face;
+}
+
+void activation_table(const mien::FaceActivations& face, const Array<const float>& expression,
+                      const Array<const float>& joints, const Array<const float>& rotation,
+                      const Array<const float>& translation, const Out<-1, -1>& out) {
+  std::vector<float> inputs = copy_of(expression), pose = copy_of(rotation);
+  inputs.insert(inputs.end(), joints.data(), joints.data() + joints.size());
+  pose.insert(pose.end(), translation.data(), translation.data() + translation.size());
+  require(inputs.size() == face.own.rest.size() && pose.size() == 6, "the face does not fit the activations");
+  require(has_shape(out, face.rows(), face.width()), "there must be a row for each triangle");
   const nb::gil_scoped_release release;
-  mien::blend_regions(shares.data(), table.data(), static_cast<int64_t>(shares.shape(0)),
-                      static_cast<int64_t>(shares.shape(1)), static_cast<int64_t>(table.shape(1)), out.data());
+  mien::activation_table(face, inputs.data(), pose.data(), out.data());
 }
 
 // Bases [n, .., r] for values [n, ..].
 template <typename Basis, typename Values>
 mien::ExpressionBases checked_bases(const Basis& basis, const Values& values, const In<-1, -1>& activations,
                                     const std::optional<Rows>& rows) {
-  const size_t rank = activations.shape(1), count = values.shape(0);
-  require(values.ndim() >= 1 && basis.ndim() == values.ndim() + 1 && basis.shape(values.ndim()) == rank &&
-              std::equal(values.shape_ptr(), values.shape_ptr() + values.ndim(), basis.shape_ptr()),
-          "a basis must have the shape of its values, followed by the activations");
+  require(values.ndim() >= 1 && basis.ndim() == values.ndim() + 1, "a basis must have one axis more than its values");
+  const size_t rank = basis.shape(values.ndim()), count = values.shape(0);
+  require(rank <= activations.shape(1) && std::equal(values.shape_ptr(), values.shape_ptr() + values.ndim(), basis.shape_ptr()),
+          "a basis must have the shape of its values, followed by at most as many columns as activations");
   const int64_t each = count == 0 ? 0 : static_cast<int64_t>(values.size() / count);
-  return {static_cast<int64_t>(count), each, static_cast<int64_t>(rank), activations.data(),
-          checked_rows(rows, count, activations.shape(0))};
+  return {static_cast<int64_t>(count), each, static_cast<int64_t>(rank), static_cast<int64_t>(activations.shape(1)),
+          activations.data(), checked_rows(rows, count, activations.shape(0))};
 }
 
 void expression_change(const Array<const float>& basis, const In<-1, -1>& activations, const std::optional<Rows>& rows,
@@ -58,26 +82,17 @@ void expression_change(const Array<const float>& basis, const In<-1, -1>& activa
   mien::expression_change(bases, basis.data(), out.data());
 }
 
-void expression_change_backward(const In<-1, -1>& activations, const std::optional<Rows>& rows,
-                                const Array<const float>& gradient, const Array<float>& grad_basis) {
-  const mien::ExpressionBases bases = checked_bases(grad_basis, gradient, activations, rows);
-  const nb::gil_scoped_release release;
-  mien::expression_change_backward(bases, gradient.data(), grad_basis.data());
-}
-
 }  // namespace
 
 void bind_expression_change(nb::module_& module) {
-  module.def("expression_activations", &expression_activations, "inputs"_a.noconvert(), "rest"_a, "directions"_a,
-             "seen"_a, "block"_a, "out"_a.noconvert(), "Fills the activations of one face.");
-  module.def("head_motion", &head_motion, "rest"_a, "pose"_a, "out"_a.noconvert(),
-             "Fills the turns and the shift of a head's pose from another one.");
-  module.def("blend_regions", &blend_regions, "shares"_a.noconvert(), "table"_a, "out"_a.noconvert(),
-             "Fills the rows [n, k] of a table [g, k] that is blended by shares [n, g].");
+  nb::class_<mien::FaceActivations>(module, "FaceActivations", "What turns a face into activations of its triangles.")
+      .def_prop_ro("shape", [](const mien::FaceActivations& own) { return std::pair(own.rows(), own.width()); });
+  module.def("make_face_activations", &make_face_activations, "rest"_a, "directions"_a, "seen"_a, "shares"_a.none(),
+             "head_rest"_a.none(), "head_directions"_a.none(), "head_seen"_a.none(), "Copies the arrays.");
+  module.def("activation_table", &activation_table, "face"_a, "expression"_a, "joints"_a, "rotation"_a,
+             "translation"_a, "out"_a.noconvert(), "Fills the activations of all triangles.");
   module.def(
       "expression_change", &expression_change, "basis"_a.noconvert(), "activations"_a, "rows"_a.none(),
       "out"_a.noconvert(),
       "Fills the changes [n, ..] of a basis [n, .., r] by rows of activations [.., r], the first if rows is None.");
-  module.def("expression_change_backward", &expression_change_backward, "activations"_a, "rows"_a.none(),
-             "gradient"_a.noconvert(), "grad_basis"_a.noconvert(), "Fills the gradient of the basis.");
 }

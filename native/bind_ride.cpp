@@ -1,15 +1,19 @@
-// Poses a face and the Gaussians bound to its triangles for a training step, in one call each way and for one timestep.
-// face.h, rig.h and activation.h do the work.
+// Poses a face and the Gaussians bound to its triangles for a training step, with their changes, in one call each way
+// and for one timestep. face.h, rig.h, bound_changes.h and activation.h do the work.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 
 #include <optional>
+#include <vector>
 
 #include "activation.h"
 #include "arrays.h"
+#include "bound_changes.h"
 #include "face.h"
 #include "face_arrays.h"
+#include "factored_terms.h"
 #include "memory.h"
 #include "rig.h"
 
@@ -17,6 +21,27 @@ namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
+
+// The changed Gaussians in the frames of their triangles, and what the network keeps of its features.
+struct KeptChanges {
+  mien::Recycled<float> means, opacity_logits;
+  std::optional<mien::Recycled<float>> features, hidden;
+
+  KeptChanges(size_t count, const mien::FeatureNetwork* network)
+      : means(3 * count), opacity_logits(count) {
+    if (!network) return;
+    features.emplace(count * static_cast<size_t>(network->features));
+    hidden.emplace(count * static_cast<size_t>(mien::hidden_stride(network->hidden)));
+  }
+  bool fits(size_t count, const mien::FeatureNetwork* network) const {
+    return means.size() == 3 * count && features.has_value() == (network != nullptr) &&
+           (!network || (features->size() == count * static_cast<size_t>(network->features) &&
+                         hidden->size() == count * static_cast<size_t>(mien::hidden_stride(network->hidden))));
+  }
+  mien::FeatureKept kept() const {
+    return features ? mien::FeatureKept{features->data(), hidden->data()} : mien::FeatureKept{};
+  }
+};
 
 // What the backward pass needs of its forward pass.
 struct Ride {
@@ -28,6 +53,7 @@ struct Ride {
   size_t face_count;
   mien::Recycled<float> shaped, vertices;
   mien::Recycled<mien::TriangleFrame> frames;
+  std::optional<KeptChanges> changes;
 
   Ride(const mien::FaceModelData& model, const mien::RigTopology& topology, bool in_head)
       : model(&model),
@@ -96,6 +122,151 @@ struct FaceParameterGradients {
   }
 };
 
+template <int... Shape>
+using MaybeIn = std::optional<In<Shape...>>;
+template <int... Shape>
+using MaybeOut = std::optional<Out<Shape...>>;
+
+template <typename A>
+auto* data_of(const std::optional<A>& array) {
+  return array ? array->data() : nullptr;
+}
+
+// First SH coefficients, the activations of triangles, and what they multiply: bases, and features with the layers of
+// their network, which has no biases.
+struct ChangeArrays {
+  static constexpr char kName[] = "ChangeArrays";
+  static constexpr const char* kFields[] = {"sh",      "activations",   "offset_basis", "color_basis", "opacity_basis",
+                                            "neutral", "feature_bases", "weight1",      "weight2"};
+  In<-1, 1, 3> sh;
+  In<-1, -1> activations;
+  MaybeIn<-1, 3, -1> offset_basis, color_basis;
+  MaybeIn<-1, -1> opacity_basis, neutral;
+  MaybeIn<-1, -1, -1> feature_bases;
+  MaybeIn<-1, -1> weight1, weight2;
+  size_t rank = 0;
+  std::vector<float> no_biases;
+  mien::FeatureNetwork network{};
+
+  ChangeArrays(const Group<ChangeArrays>& group, const mien::RigTopology& topology) {
+    group.read(sh, activations, offset_basis, color_basis, opacity_basis, neutral, feature_bases, weight1, weight2);
+    const size_t count = topology.face_index.size(), width = activations.shape(1);
+    require(sh.shape(0) == count && activations.shape(0) == topology.faces.size() / 3,
+            "there must be coefficients for each Gaussian, and activations for each triangle");
+    if (offset_basis) rank = offset_basis->shape(2);
+    else if (color_basis) rank = color_basis->shape(2);
+    else if (opacity_basis) rank = opacity_basis->shape(1);
+    require(rank <= width && (!offset_basis || has_shape(*offset_basis, count, 3, rank)) &&
+                (!color_basis || has_shape(*color_basis, count, 3, rank)) &&
+                (!opacity_basis || has_shape(*opacity_basis, count, rank)),
+            "bases must have one row per Gaussian, and no more columns than activations");
+    require(neutral.has_value() == feature_bases.has_value() && neutral.has_value() == weight1.has_value() &&
+                neutral.has_value() == weight2.has_value(),
+            "features need bases and both layers");
+    if (!neutral) return;
+    const size_t features = neutral->shape(1), hidden = weight1->shape(0);
+    require(features >= 1 && hidden >= 1, "features and hidden values must not be empty");
+    for (const size_t length : {features, hidden, width}) checked_length(length, kMostWidth, "numbers in a row");
+    require(neutral->shape(0) == count && has_shape(*feature_bases, count, width, features) &&
+                has_shape(*weight1, hidden, features) && has_shape(*weight2, 4, hidden),
+            "features and layers do not fit each other");
+    no_biases.assign(hidden + 4, 0.0f);
+    network = {static_cast<int64_t>(count), static_cast<int>(features), 0, static_cast<int>(hidden), 4,
+               neutral->data(), nullptr, weight1->data(), no_biases.data(), weight2->data(),
+               no_biases.data() + hidden};
+  }
+  mien::ChangeBases bases(const mien::RigTopology& topology) const {
+    const auto width = static_cast<int64_t>(activations.shape(1));
+    const int64_t* const rows = topology.face_index.data();
+    return {static_cast<int64_t>(sh.shape(0)), static_cast<int64_t>(rank), data_of(offset_basis),
+            data_of(color_basis), data_of(opacity_basis), activations.data(), width, rows,
+            neutral ? &network : nullptr, {data_of(feature_bases), width, activations.data(), rows}};
+  }
+};
+
+// The changed coefficients, the changes, and the weighted mean squares of the linear ones and of the features'.
+struct ChangedArrays {
+  static constexpr char kName[] = "ChangedArrays";
+  static constexpr const char* kFields[] = {"sh",           "offset",          "color",  "opacity",
+                                            "feature_color", "feature_opacity", "linear", "features"};
+  Out<-1, 1, 3> sh;
+  MaybeOut<-1, 3> offset, color;
+  MaybeOut<-1> opacity;
+  MaybeOut<-1, 3> feature_color;
+  MaybeOut<-1> feature_opacity;
+  Out<> linear, features;
+
+  ChangedArrays(const Group<ChangedArrays>& group, const ChangeArrays& own) {
+    group.read(sh, offset, color, opacity, feature_color, feature_opacity, linear, features);
+    const size_t count = own.sh.shape(0);
+    require(has_shape(sh, count, 1, 3) && is_for(offset, own.offset_basis, count) &&
+                is_for(color, own.color_basis, count) && is_for(opacity, own.opacity_basis, count) &&
+                is_for(feature_color, own.neutral, count) && is_for(feature_opacity, own.neutral, count),
+            "there must be a change for each basis, with one row per Gaussian");
+  }
+  mien::GaussianChanges<float> changes() const {
+    return {data_of(offset), data_of(color), data_of(opacity), data_of(feature_color), data_of(feature_opacity)};
+  }
+
+ private:
+  template <typename A, typename B>
+  static bool is_for(const std::optional<A>& change, const std::optional<B>& basis, size_t count) {
+    return change.has_value() == basis.has_value() && (!change || change->shape(0) == count);
+  }
+};
+
+// The gradients of what `ChangedArrays` holds. Each may be missing.
+struct ByChangedArrays {
+  static constexpr char kName[] = "ByChangedArrays";
+  static constexpr const char* kFields[] = {"sh",           "offset",          "color",  "opacity",
+                                            "feature_color", "feature_opacity", "linear", "features"};
+  MaybeIn<-1, 1, 3> sh;
+  MaybeIn<-1, 3> offset, color;
+  MaybeIn<-1> opacity;
+  MaybeIn<-1, 3> feature_color;
+  MaybeIn<-1> feature_opacity;
+  MaybeIn<> linear, features;
+
+  ByChangedArrays(const Group<ByChangedArrays>& group, size_t count) {
+    group.read(sh, offset, color, opacity, feature_color, feature_opacity, linear, features);
+    require(fits(sh, count) && fits(offset, count) && fits(color, count) && fits(opacity, count) &&
+                fits(feature_color, count) && fits(feature_opacity, count),
+            "a gradient must have one row per Gaussian");
+  }
+  mien::GaussianChanges<const float> changes() const {
+    return {data_of(offset), data_of(color), data_of(opacity), data_of(feature_color), data_of(feature_opacity)};
+  }
+
+ private:
+  template <typename A>
+  static bool fits(const std::optional<A>& gradient, size_t count) {
+    return !gradient || gradient->shape(0) == count;
+  }
+};
+
+// The gradients of bases, features and layers, as far as `ChangeArrays` has them.
+struct ChangeGradientArrays {
+  static constexpr char kName[] = "ChangeGradients";
+  static constexpr const char* kFields[] = {"offset_basis", "color_basis", "opacity_basis",
+                                            "features",     "weight1",     "weight2"};
+  MaybeOut<-1, 3, -1> offset_basis, color_basis;
+  MaybeOut<-1, -1> opacity_basis, features, weight1, weight2;
+
+  ChangeGradientArrays(const Group<ChangeGradientArrays>& group, const ChangeArrays& own) {
+    group.read(offset_basis, color_basis, opacity_basis, features, weight1, weight2);
+    require(same(offset_basis, own.offset_basis) && same(color_basis, own.color_basis) &&
+                same(opacity_basis, own.opacity_basis) && same(features, own.neutral) && same(weight1, own.weight1) &&
+                same(weight2, own.weight2),
+            "a gradient must have the shape of its array");
+  }
+
+ private:
+  template <typename A, typename B>
+  static bool same(const std::optional<A>& gradient, const std::optional<B>& array) {
+    return gradient.has_value() == array.has_value() && (!gradient || same_shape(*gradient, *array));
+  }
+};
+
 // The inputs of both passes.
 struct Rider {
   const mien::RigTopology& topology;
@@ -116,22 +287,43 @@ struct Rider {
     return pose;
   }
   mien::RigArrays rig(const Ride& ride) const {
-    return mien::rig_arrays(topology, ride.vertices.data(), local.means.data(), local.quats.data(),
-                            local.log_scales.data());
+    const float* const means = ride.changes ? ride.changes->means.data() : local.means.data();
+    return mien::rig_arrays(topology, ride.vertices.data(), means, local.quats.data(), local.log_scales.data());
   }
 };
 
+// Fills the changes, and the changed Gaussians in the frames of their triangles.
+void change(const Rider& rider, const ChangeArrays& own, const ChangedArrays& changed, std::pair<float, float> weights,
+            Ride& ride) {
+  const mien::ChangeBases bases = own.bases(rider.topology);
+  ride.changes.emplace(rider.count(), bases.network);
+  const mien::ChangeSquares squares = mien::change_gaussians(
+      bases, ride.changes->kept(),
+      {rider.local.means.data(), rider.local.opacity_logits.data(), own.sh.data()}, changed.changes(),
+      {ride.changes->means.data(), ride.changes->opacity_logits.data(), changed.sh.data()});
+  *changed.linear.data() = weights.first * static_cast<float>(squares.linear);
+  *changed.features.data() = weights.second * static_cast<float>(squares.features);
+}
+
 Ride forward(const mien::FaceModelData& model, const mien::RigTopology& topology, bool in_head,
              const Group<FaceArrays>& face_group, const Group<LocalGaussians<const float>>& local_group,
-             const Group<PosedGaussians<float>>& posed_group) {
+             const Group<PosedGaussians<float>>& posed_group, const std::optional<Group<ChangeArrays>>& change_group,
+             const std::optional<Group<ChangedArrays>>& changed_group, std::pair<float, float> weights) {
   const Rider rider(model, topology, in_head, face_group, local_group);
   const PosedGaussians<float> posed(posed_group, rider.count());
   require(!in_head || posed.head_pose.has_value(), "`head_pose` is missing");
+  require(change_group.has_value() == changed_group.has_value(), "changes need arrays to be filled");
+  std::optional<ChangeArrays> changes;
+  std::optional<ChangedArrays> changed;
+  if (change_group) changes.emplace(*change_group, topology);
+  if (changed_group) changed.emplace(*changed_group, *changes);
   const nb::gil_scoped_release release;
   Ride ride(model, topology, in_head);
+  if (changes) change(rider, *changes, *changed, weights, ride);
   mien::pose_face(model, rider.pose(), ride.shaped.data(), ride.vertices.data());
   mien::rig_forward(rider.rig(ride), ride.frames.data(), {posed.means.data(), posed.quats.data(), posed.scales.data()});
-  mien::sigmoid(rider.local.opacity_logits.data(), static_cast<int64_t>(rider.count()), posed.opacities.data());
+  const float* const logits = ride.changes ? ride.changes->opacity_logits.data() : rider.local.opacity_logits.data();
+  mien::sigmoid(logits, static_cast<int64_t>(rider.count()), posed.opacities.data());
   if (in_head) {
     mien::head_pose(rider.face.head_rotation->data(), rider.face.head_translation->data(), posed.head_pose->data());
   }
@@ -181,6 +373,33 @@ void backward(const Ride& ride, const mien::FaceModelData& model, const mien::Ri
   if (by_face) face_backward(model, ride, rider, by_vertices->data(), by_posed.head_pose, *by_face);
 }
 
+// Fills the gradients of bases, features and layers, from those that `backward` filled of the changed Gaussians.
+void changes_backward(const Ride& ride, const mien::RigTopology& topology, const Group<ChangeArrays>& change_group,
+                      const Group<ChangedArrays>& changed_group, std::pair<float, float> weights, const In<-1, 3>& by_means,
+                      const In<-1>& by_opacity_logits, const Group<ByChangedArrays>& by_changed_group,
+                      const Group<ChangeGradientArrays>& gradient_group) {
+  const size_t count = topology.face_index.size();
+  require(ride.topology == &topology && ride.changes.has_value(), "the ride belongs to another topology");
+  const ChangeArrays own(change_group, topology);
+  const ChangedArrays changed(changed_group, own);
+  const ByChangedArrays by(by_changed_group, count);
+  const ChangeGradientArrays out(gradient_group, own);
+  require(by_means.shape(0) == count && by_opacity_logits.shape(0) == count,
+          "a gradient must have one row per Gaussian");
+  const mien::ChangeBases bases = own.bases(topology);
+  require(ride.changes->fits(count, bases.network), "the ride had other changes");
+  const float linear = by.linear ? weights.first * *by.linear->data() : 0;
+  const float features = by.features ? weights.second * *by.features->data() : 0;
+  const mien::GaussianChanges<float> values = changed.changes();
+  const nb::gil_scoped_release release;
+  mien::change_gaussians_backward(
+      bases, ride.changes->kept(),
+      {values.offset, values.color, values.opacity, values.feature_color, values.feature_opacity},
+      {{by_means.data(), by_opacity_logits.data(), data_of(by.sh)}, by.changes(), linear, features,
+       data_of(out.offset_basis), data_of(out.color_basis), data_of(out.opacity_basis), data_of(out.features),
+       data_of(out.weight1), data_of(out.weight2)});
+}
+
 }  // namespace
 
 void bind_ride(nb::module_& module) {
@@ -188,8 +407,16 @@ void bind_ride(nb::module_& module) {
   bind_group<LocalGaussians<float>>(module);
   bind_group<PosedGaussians<float>>(module);
   bind_group<FaceParameterGradients>(module);
+  bind_group<ChangeArrays>(module);
+  bind_group<ChangedArrays>(module);
+  bind_group<ByChangedArrays>(module);
+  bind_group<ChangeGradientArrays>(module);
   module.def("ride", &forward, "model"_a, "topology"_a, "in_head"_a, "face"_a, "local"_a, "posed"_a,
+             "changes"_a.none() = nb::none(), "changed"_a.none() = nb::none(), "weights"_a = std::pair(0.0f, 0.0f),
              "Fills the Gaussians in world space or, with `in_head`, in the head frame together with its pose.");
+  module.def("ride_changes_backward", &changes_backward, "ride"_a, "topology"_a, "changes"_a, "changed"_a, "weights"_a,
+             "by_means"_a, "by_opacity_logits"_a, "by_changed"_a, "gradients"_a,
+             "Fills the gradients of what changes Gaussians, from those that `ride_backward` filled.");
   module.def("ride_backward", &backward, "ride"_a, "model"_a, "topology"_a, "face"_a, "local"_a, "scales"_a,
              "opacities"_a, "by_posed"_a, "by_local"_a, "by_face"_a.none(),
              "Fills the gradients, from the scales and opacities that `ride` filled. `by_face` may be None.");

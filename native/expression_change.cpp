@@ -21,10 +21,10 @@ float dot(const float* one, const float* other, int64_t count) {
 
 // What the activations of a block are multiplied by.
 float shortening(const ActivationArrays& arrays, const float* values, int64_t begin) {
-  if (arrays.seen_count == 0) return 1;
+  if (arrays.seen.empty()) return 1;
   float furthest = kLeastSeen;
-  for (int64_t s = 0; s < arrays.seen_count; ++s)
-    furthest = std::max(furthest, dot(values, arrays.seen + s * arrays.rank + begin, arrays.block));
+  for (size_t s = 0; s < arrays.seen.size(); s += arrays.rank)
+    furthest = std::max(furthest, dot(values, arrays.seen.data() + s + begin, arrays.block));
   const float ratio = dot(values, values, arrays.block) / furthest, over = ratio - 1;
   return over > 0 ? (1 + kMargin * over / (kMargin + over)) / ratio : 1;
 }
@@ -33,20 +33,18 @@ template <class Each>
 void for_all(const ExpressionBases& bases, const Each& each) {
   parallel_for((bases.count + kGrain - 1) / kGrain, [&](int64_t piece) {
     for (int64_t i = piece * kGrain; i < std::min((piece + 1) * kGrain, bases.count); ++i) {
-      const float* activations = bases.activations + (bases.rows ? bases.rows[i] * bases.rank : 0);
+      const float* activations = bases.activations + (bases.rows ? bases.rows[i] * bases.width : 0);
       for (int64_t v = i * bases.values; v < (i + 1) * bases.values; ++v) each(activations, v);
     }
   });
 }
 
-}  // namespace
-
 // No operation here may round in two ways, so these use neither `exp` nor kernels.
-void expression_activations(const ActivationArrays& arrays, float* out) {
+void activations_along(const ActivationArrays& arrays, const float* inputs, float* out) {
   for (int64_t k = 0; k < arrays.rank; ++k) {
     float sum = 0;
-    for (int64_t i = 0; i < arrays.inputs_count; ++i) {
-      sum += (arrays.inputs[i] - arrays.rest[i]) * arrays.directions[i * arrays.rank + k];
+    for (size_t i = 0; i < arrays.rest.size(); ++i) {
+      sum += (inputs[i] - arrays.rest[i]) * arrays.directions[i * arrays.rank + k];
     }
     out[k] = sum;
   }
@@ -56,6 +54,7 @@ void expression_activations(const ActivationArrays& arrays, float* out) {
   }
 }
 
+// How the head moved: the sines of its turns about its own axes at rest, and its shift along them, in metres.
 void head_motion(const float* rest, const float* pose, float* out) {
   float from[16], to[16], turn[9];
   head_pose(rest, rest + 3, from);
@@ -72,27 +71,45 @@ void head_motion(const float* rest, const float* pose, float* out) {
   out[0] = (turn[7] - turn[5]) / 2, out[1] = (turn[2] - turn[6]) / 2, out[2] = (turn[3] - turn[1]) / 2;
 }
 
-void blend_regions(const float* shares, const float* table, int64_t rows, int64_t regions, int64_t width, float* out) {
-  for (int64_t row = 0; row < rows; ++row) {
+// out [rows, width] = shares [rows, regions] table [regions, width], in the order of the regions.
+void blend_regions(const FaceActivations& face, const float* table, float* out) {
+  const int64_t regions = face.regions(), width = face.width();
+  for (int64_t row = 0; row < face.rows(); ++row) {
     float* const to = out + row * width;
     std::fill_n(to, width, 0.0f);
     for (int64_t region = 0; region < regions; ++region) {
-      const float share = shares[row * regions + region];
+      const float share = face.shares[row * regions + region];
       if (share == 0) continue;
       for (int64_t k = 0; k < width; ++k) to[k] += share * table[region * width + k];
     }
   }
 }
 
+}  // namespace
+
+void activation_table(const FaceActivations& face, const float* inputs, const float* pose, float* out) {
+  const int64_t width = face.width(), of_head = width - face.own.block;
+  std::vector<float> own(face.own.rank), head(of_head), table(face.regions() * width);
+  activations_along(face.own, inputs, own.data());
+  if (of_head > 0) {
+    float motion[6];
+    head_motion(face.head_rest.data(), pose, motion);
+    activations_along(face.head, motion, head.data());
+  }
+  for (int64_t region = 0; region < face.regions(); ++region) {
+    float* to = table.data() + region * width;
+    for (int64_t k = 0; k < std::max(face.own.block, of_head); ++k) {
+      if (k < face.own.block) *to++ = own[region * face.own.block + k];
+      if (k < of_head) *to++ = head[k];
+    }
+  }
+  if (face.shares.empty()) std::copy(table.begin(), table.end(), out);
+  else blend_regions(face, table.data(), out);
+}
+
 void expression_change(const ExpressionBases& bases, const float* basis, float* out) {
   for_all(bases,
           [&](const float* activations, int64_t v) { out[v] = dot(basis + v * bases.rank, activations, bases.rank); });
-}
-
-void expression_change_backward(const ExpressionBases& bases, const float* gradient, float* grad_basis) {
-  for_all(bases, [&](const float* activations, int64_t v) {
-    for (int64_t k = 0; k < bases.rank; ++k) grad_basis[v * bases.rank + k] = activations[k] * gradient[v];
-  });
 }
 
 }  // namespace mien

@@ -3,41 +3,43 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 namespace mien {
 
-// Activations of one face: (inputs - rest) directions, each block of them softly shortened to how far training saw
+// Activations along directions: (inputs - rest) directions, each block of them softly shortened to how far training saw
 // faces go that way.
 struct ActivationArrays {
-  const float* inputs;  // [inputs_count]
-  int64_t inputs_count;
-  const float* rest;        // [inputs_count]
-  const float* directions;  // [inputs_count, rank]
-  int64_t rank, block;      // block: the number of activations that are shortened together; it divides rank
-  const float* seen;        // [seen_count, rank]: activations that training saw; none shortens nothing
-  int64_t seen_count;
+  std::vector<float> rest;        // [inputs]
+  std::vector<float> directions;  // [inputs, rank]
+  std::vector<float> seen;        // [.., rank]: activations that training saw; none shortens nothing
+  int64_t rank, block;            // block: the number of activations that are shortened together; it divides rank
 };
-// Fills out [rank]. Sums run in the order of the inputs, so that training and the runtime get the same bits.
-void expression_activations(const ActivationArrays& arrays, float* out);
 
-// How the head moved: the sines of its turns about its own axes at rest, and its shift along them, in metres. Poses are
-// an axis-angle vector, then the place.
-void head_motion(const float* rest, const float* pose, float* out);
+// Activations of a face's triangles: of the regions, a block of `own` for each, and of the pose of the head.
+struct FaceActivations {
+  ActivationArrays own;
+  std::vector<float> head_rest;  // [6], an axis-angle vector, then the place in metres; empty without a pose
+  ActivationArrays head;         // of the head's motion [6]
+  std::vector<float> shares;     // [rows, regions]; empty if the face is one region
 
-// out [rows, width] = shares [rows, regions] table [regions, width], in the order of the regions.
-void blend_regions(const float* shares, const float* table, int64_t rows, int64_t regions, int64_t width, float* out);
+  int64_t regions() const { return own.rank / own.block; }
+  int64_t width() const { return own.block + (head_rest.empty() ? 0 : head.rank); }
+  int64_t rows() const { return shares.empty() ? 1 : static_cast<int64_t>(shares.size()) / regions(); }
+};
+// Fills out [rows, width]: activations of the face and of the head in turn, as long as there are both. `inputs` are
+// expression coefficients, then joints; `pose` [6] is that of the head. Sums run in the order of the inputs, so that
+// training and the runtime get the same bits.
+void activation_table(const FaceActivations& face, const float* inputs, const float* pose, float* out);
 
-// Bases [count, values, rank] of Gaussians, each with a row of activations [.., rank]: that of `rows` [count], or the
-// first if it is null.
+// Bases [count, values, rank] of Gaussians, each with the first numbers of a row of activations [.., width]: that of
+// `rows` [count], or the first if it is null.
 struct ExpressionBases {
-  int64_t count, values, rank;
+  int64_t count, values, rank, width;
   const float* activations;
   const int64_t* rows;
 };
 // Fills out [count, values], the sums of the bases' columns weighted by the activations. Runs on the pool.
 void expression_change(const ExpressionBases& bases, const float* basis, float* out);
-
-// Fills the gradient of the bases. Runs on the pool.
-void expression_change_backward(const ExpressionBases& bases, const float* gradient, float* grad_basis);
 
 }  // namespace mien

@@ -30,6 +30,7 @@ class Recycled {
     if (data_) give_memory(data_, bytes_);
   }
   T* data() const { return data_; }
+  size_t size() const { return bytes_ / sizeof(T); }
 
  private:
   size_t bytes_;

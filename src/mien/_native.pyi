@@ -210,6 +210,53 @@ class FaceParameterGradients(NamedTuple):
     head_rotation: Tensor
     head_translation: Tensor
 
+class ChangeArrays(NamedTuple):
+    """What changes n Gaussians: activations [f, a] of triangles, bases with r columns, features with two layers."""
+
+    sh: Tensor
+    activations: Tensor
+    offset_basis: Tensor | None
+    color_basis: Tensor | None
+    opacity_basis: Tensor | None
+    neutral: Tensor | None
+    feature_bases: Tensor | None
+    weight1: Tensor | None
+    weight2: Tensor | None
+
+class ChangedArrays(NamedTuple):
+    """Changed coefficients, the changes, and the weighted mean squares of linear changes and of the features'."""
+
+    sh: Tensor
+    offset: Tensor | None
+    color: Tensor | None
+    opacity: Tensor | None
+    feature_color: Tensor | None
+    feature_opacity: Tensor | None
+    linear: Tensor
+    features: Tensor
+
+class ByChangedArrays(NamedTuple):
+    """The gradients of what `ChangedArrays` holds. Those that are None are 0."""
+
+    sh: Tensor | None
+    offset: Tensor | None
+    color: Tensor | None
+    opacity: Tensor | None
+    feature_color: Tensor | None
+    feature_opacity: Tensor | None
+    linear: Tensor | None
+    features: Tensor | None
+
+class ChangeGradients(NamedTuple):
+    """`features` is the gradient of `ChangeArrays.neutral`, and the rows of that of `feature_bases`."""
+
+    offset_basis: Tensor | None
+    color_basis: Tensor | None
+    opacity_basis: Tensor | None
+    features: Tensor | None
+    weight1: Tensor | None
+    weight2: Tensor | None
+
 def ride(
     model: FaceModelData,
     topology: RigTopology,
@@ -217,8 +264,11 @@ def ride(
     face: FaceArrays,
     local: LocalGaussians,
     posed: PosedGaussians,
+    changes: ChangeArrays | None = None,
+    changed: ChangedArrays | None = None,
+    weights: tuple[float, float] = (0, 0),
 ) -> Ride:
-    """Fills `posed`."""
+    """Fills `posed` and, with `changes`, `changed`."""
 
 def ride_backward(
     ride: Ride,
@@ -233,6 +283,19 @@ def ride_backward(
     by_face: FaceParameterGradients | None,
 ) -> None:
     """Fills the gradients `by_local` and `by_face` from `by_posed`, the gradients of the posed Gaussians."""
+
+def ride_changes_backward(
+    ride: Ride,
+    topology: RigTopology,
+    changes: ChangeArrays,
+    changed: ChangedArrays,
+    weights: tuple[float, float],
+    by_means: Tensor,
+    by_opacity_logits: Tensor,
+    by_changed: ByChangedArrays,
+    gradients: ChangeGradients,
+) -> None:
+    """Fills `gradients` from those that `ride_backward` filled, and from `by_changed`."""
 
 # native/bind_training.cpp
 class AdamTask(NamedTuple):
@@ -407,23 +470,28 @@ def bake_texture(
 def light_equations(surface: AlignSurface, sighting: SightingArrays, hessian: Tensor, right: Tensor) -> None: ...
 
 # native/bind_expression_change.cpp
-def expression_activations(
-    inputs: Tensor, rest: Tensor, directions: Tensor, seen: Tensor, block: int, out: Tensor
+class FaceActivations:
+    shape: tuple[int, int]
+    """Of a table: triangles, or 1 if the face is one region, and activations."""
+
+def make_face_activations(
+    rest: Tensor,
+    directions: Tensor,
+    seen: Tensor,
+    shares: Tensor | None,
+    head_rest: Tensor | None,
+    head_directions: Tensor | None,
+    head_seen: Tensor | None,
+) -> FaceActivations:
+    """Copies the arrays of `mien.runtime.baked.ExpressionChanges`."""
+
+def activation_table(
+    face: FaceActivations, expression: Tensor, joints: Tensor, rotation: Tensor, translation: Tensor, out: Tensor
 ) -> None:
-    """Fills `out` [r]. `block` activations, a divisor of r, are shortened together."""
-
-def head_motion(rest: Tensor, pose: Tensor, out: Tensor) -> None:
-    """Fills `out` [6]: sines of turns, then a shift in metres. Poses [6] are an axis-angle vector, then a place."""
-
-def blend_regions(shares: Tensor, table: Tensor, out: Tensor) -> None:
-    """Fills `out` [n, k], shares [n, g] times table [g, k]."""
+    """Fills `out` with the activations of one face."""
 
 def expression_change(basis: Tensor, activations: Tensor, rows: Tensor | None, out: Tensor) -> None:
-    """Fills `out` [n, ..], of a basis [n, .., r] and rows [n] of activations [g, r], the first if there are none."""
-
-def expression_change_backward(
-    activations: Tensor, rows: Tensor | None, gradient: Tensor, grad_basis: Tensor
-) -> None: ...
+    """Fills `out` [n, ..], of a basis [n, .., r] and rows [n] of activations [g, a], the first if there are none."""
 
 # native/bind_activation.cpp; any shape
 def sigmoid(values: Tensor, out: Tensor) -> None: ...

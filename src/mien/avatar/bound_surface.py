@@ -265,7 +265,7 @@ class BoundSurface:
         Those on triangles that are not `held` add 0. None if there are no changes.
         """
         counts = held.index_select(0, self.triangles())
-        own = {name: values * counts.view(-1, *[1] * (values.ndim - 1)) for name, values in changes.items()}
+        own = {name: own * counts.view(-1, *[1] * (own.ndim - 1)) for name, own in changes.items() if own.ndim > 0}
         penalties = self._penalties(own)
         return torch.stack(list(penalties.values())).sum() if penalties else None
 

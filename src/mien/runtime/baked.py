@@ -120,7 +120,7 @@ class HeadActivations:
     """Activations of the head's pose, by how far the head moved from its pose at rest: six numbers.
 
     They are the sines of its turns about its own axes there, (R - R^T) / 2 of its rotation R, and its shift along these
-    axes, in metres. `_native.head_motion` computes them. `directions` and `seen` are as in `ExpressionChanges`.
+    axes, in metres. `_native.activation_table` computes them. `directions` and `seen` are as in `ExpressionChanges`.
     """
 
     rest: Float32[np.ndarray, " 6"]
@@ -136,7 +136,7 @@ class ExpressionChanges:
     The activations of the face are (inputs - rest) directions: r/g for each of g regions, one region after the other.
     Let x be those of a region, and d their length. The furthest that a row of `seen` goes along them is
     l = max (seen x) / d. If d is beyond l, they are shortened to the length l + m o / (m + o), with o = d - l and
-    m = l / 10. `_native.expression_activations` computes this.
+    m = l / 10. `_native.activation_table` computes this.
 
     A triangle has the sum of the regions' activations weighted by `shares`, and those of the head's pose. A Gaussian
     has the activations of its triangle: one of the face and one of the head in turn, as long as there are both.

@@ -14,6 +14,7 @@ from mien.runtime.baked import (
     BlendSkinned,
     ExpressionChanges,
     FeatureChanges,
+    FeatureDirections,
     LinearBases,
     MeshBound,
     Rig,
@@ -193,13 +194,12 @@ def expression_changes(
     """Return the changes of the raw values, by the names of the parts: [n, 3], [n] and [n, 3]. None changes nothing."""
     table = activation_table(changes, face)
     rows = None if changes.shares is None else face_index.astype(np.int64)
-    first = np.ascontiguousarray(table[:, : changes.basis_columns])
     added = {}
     for name in ("color", "opacity_logits", "means"):
         basis = getattr(changes, name)
         if basis is not None:
             added[name] = np.empty(basis.shape[:-1], np.float32)
-            _native.expression_change(np.ascontiguousarray(basis), first, rows, added[name])
+            _native.expression_change(np.ascontiguousarray(basis), table, rows, added[name])
     if changes.features is not None:
         color, opacity_logits = feature_changes(changes.features, table, rows)
         added["color"] = added.get("color", np.float32(0)) + color
@@ -207,46 +207,29 @@ def expression_changes(
     return added
 
 
-def activation_table(changes: ExpressionChanges, face: Face) -> Float32[np.ndarray, "_ a"]:
+def activation_table(changes: ExpressionChanges | FeatureDirections, face: Face) -> Float32[np.ndarray, "_ a"]:
     """The activations of each triangle, or one row for all if the face is one region; the same in training."""
-    regions = 1 if changes.shares is None else changes.shares.shape[1]
-    own = _along(face, changes.rest, changes.directions, changes.seen, regions).reshape(regions, -1)
-    table, head = own, changes.head
-    if head is not None:
-        motion, pose = np.empty(6, np.float32), np.empty(head.directions.shape[1], np.float32)
-        now = np.concatenate([face.head_rotation, face.head_translation]).astype(np.float32, copy=False)
-        _native.head_motion(head.rest, now, motion)
-        if len(pose):
-            _native.expression_activations(motion, np.zeros(6, np.float32), head.directions, head.seen, len(pose), pose)
-        together = np.concatenate([own, np.broadcast_to(pose, (regions, len(pose)))], axis=1)
-        table = np.ascontiguousarray(together[:, columns_of_activations(own.shape[1], len(pose))])
-    if changes.shares is None:
-        return table
-    out = np.empty((len(changes.shares), table.shape[1]), np.float32)
-    _native.blend_regions(changes.shares, table, out)
+    known = _activations.get(changes)
+    if known is None:
+        known = _activations[changes] = face_activations(changes)
+    out = np.empty(known.shape, np.float32)
+    parts = (face.expression, face.joints, face.head_rotation, face.head_translation)
+    _native.activation_table(known, *(_contiguous_row(part) for part in parts), out)
     return out
 
 
-def columns_of_activations(own: int, head: int) -> list[int]:
-    """The order of a Gaussian's activations, out of `own` of the face, then `head` of the head's pose: one of each."""
-    places = [(2 * index, index) for index in range(own)] + [(2 * index + 1, own + index) for index in range(head)]
-    return [column for _, column in sorted(places)]
+def face_activations(changes: ExpressionChanges | FeatureDirections) -> _native.FaceActivations:
+    """What turns a face into activations, in the form that the core takes."""
+    shares = head = None
+    seen = np.empty((0, changes.directions.shape[1]), np.float32)
+    if isinstance(changes, ExpressionChanges):
+        seen, shares, head = changes.seen, changes.shares, changes.head
+    of_head = (None, None, None) if head is None else (head.rest, head.directions, head.seen)
+    arrays = (changes.rest, changes.directions, seen, shares, *of_head)
+    return _native.make_face_activations(*(None if one is None else _contiguous_row(one) for one in arrays))
 
 
-def _along(
-    face: Face,
-    rest: Float32[np.ndarray, " i"],
-    directions: Float32[np.ndarray, "i r"],
-    seen: Float32[np.ndarray, "_ r"] | None = None,
-    regions: int = 1,
-) -> Float32[np.ndarray, " r"]:
-    """(inputs - rest) directions, shortened in each region to what training saw, by the same operation as there."""
-    inputs = np.concatenate([face.expression, face.joints.reshape(-1)]).astype(np.float32, copy=False)
-    activations = np.empty(directions.shape[1], np.float32)
-    limits = np.empty((0, len(activations)), np.float32) if seen is None else seen
-    block = len(activations) // regions
-    _native.expression_activations(inputs, rest, directions, limits, block, activations)
-    return activations
+_activations: "WeakKeyDictionary[ExpressionChanges | FeatureDirections, _native.FaceActivations]" = WeakKeyDictionary()
 
 
 def feature_changes(
@@ -336,8 +319,7 @@ def _run_native(network: AttributeNetwork, face: Face) -> tuple[np.ndarray, np.n
         layers = zip(network.weights, network.biases, strict=True)
         arrays = [np.ascontiguousarray(array, np.float32) for layer in layers for array in layer]
         prepared = _networks[network] = _native.FeatureNetwork(*rows, *arrays)
-    activations = _along(face, along.rest, along.directions)
-    bases = _native.FeatureBases(np.ascontiguousarray(along.basis), activations[None], None)
+    bases = _native.FeatureBases(np.ascontiguousarray(along.basis), activation_table(along, face), None)
     n, outputs = len(network.base), len(network.biases[-1])
     sh, opacity_logits = np.empty((n, outputs - 1), np.float32), np.empty(n, np.float32)
     _native.feature_network(prepared, bases, None, sh, opacity_logits)
@@ -357,8 +339,7 @@ def run_network(
     """The outputs of an attribute network, in numpy. This is the reference of `_native.feature_network`."""
     along = network.along
     if along is not None:
-        activations = _along(face, along.rest, along.directions)
-        blended = _combined(along.basis.swapaxes(0, 1), activations)
+        blended = _combined(along.basis.swapaxes(0, 1), activation_table(along, face)[0])
         values = network.base.copy()
         values[:, : blended.shape[1]] += blended
     else:

@@ -12,14 +12,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.adam import FactoredGradient
 from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
 from mien.avatar.baking import as_array, bake_rig
 from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.density import GradientDensity
-from mien.avatar.gaussian_avatars.changes import BASES, FeatureAppearance, change_penalties, feature_tensors
+from mien.avatar.gaussian_avatars.changes import APPEARANCE_WEIGHT, FeatureAppearance, feature_tensors
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.avatar.ops.bound_gaussians import pose_bound_gaussians
-from mien.avatar.ops.expression_changes import ExpressionActivations, expression_change
+from mien.avatar.ops.changed_gaussians import BASES, PENALTIES, Changes, mean_squares, pose_changed_gaussians
+from mien.avatar.ops.expression_changes import ExpressionActivations
 from mien.avatar.ops.triangle_penalties import triangle_penalties
 from mien.avatar.settings import TRAINED, Progress, Rate, active_degree
 from mien.avatar.store import GaussianStore
@@ -52,7 +54,7 @@ class GaussianAvatars(Avatar):
             limited=config.surface_limits,
             first_colors=config.first_colors == "pictures",
             bases=("feature_bases", *BASES),
-            penalties=lambda changes: change_penalties(config, changes),
+            penalties=lambda changes: mean_squares(changes, (config.expression_weight, APPEARANCE_WEIGHT)),
         )
         super().__init__(config, face_model, face, Extras(surface=surface))
         like, n = face_model.template, face_model.faces.shape[0]
@@ -88,23 +90,11 @@ class GaussianAvatars(Avatar):
             each = [self._pose_with_changes(face[timestep], sh, in_head) for timestep in range(len(face))]
             aux = {name: torch.stack([posed.aux[name] for posed in each]) for name in each[0].aux}
             return Posed(stack_timesteps([posed.gaussians for posed in each]), aux)
-        activations = self.activations(face)
-        # Bases take the first activations, which are those of the largest spread.
-        first, rows = activations[:, : self.config.expression_rank], self.store["face_index"]
-        changes = {name: expression_change(self.store[name], first, rows) for name in self._basis_shapes()}
-        local = {name: self.store[name] for name in ("face_index", "means", "quats", "log_scales", "opacity_logits")}
-        if self.appearance is not None:
-            changes["feature_color"], changes["feature_opacity"] = self.appearance(self.store, activations)
-        if "offset_basis" in changes:
-            local["means"] = local["means"] + changes["offset_basis"]
-        # Changes are added up before they join a value, as `mien.runtime` does, which gives the same bytes.
-        if opacity := [changes[name] for name in ("opacity_basis", "feature_opacity") if name in changes]:
-            local["opacity_logits"] = local["opacity_logits"] + sum(opacity[1:], opacity[0])
-        if color := [changes[name] for name in ("color_basis", "feature_color") if name in changes]:
-            change = sum(color[1:], color[0])[:, None]
-            # Joining with nothing takes ten times as long as the sum.
-            sh = sh + change if sh.shape[1] == 1 else torch.cat([sh[:, :1] + change, sh[:, 1:]], dim=1)
-        return Posed(pose_bound_gaussians(self.face_model, face, local, sh, in_head), changes)
+        layers = None if self.appearance is None else self.appearance.layers()
+        gradient = FactoredGradient() if self.appearance is None else self.appearance.gradient
+        weights = (self.config.expression_weight, APPEARANCE_WEIGHT)
+        changes = Changes(self.activations(face), tuple(self._basis_shapes()), layers, gradient, weights)
+        return Posed(*pose_changed_gaussians(self.face_model, face, self.store, sh, in_head, changes))
 
     def _basis_shapes(self) -> dict[str, tuple[int, ...]]:
         """The shapes of a Gaussian's bases of changes with the expression, by name: those that the settings ask for."""
@@ -138,7 +128,8 @@ class GaussianAvatars(Avatar):
             thresholds=(1.0, config.scale_threshold),
             weights=(config.position_weight, 1.0),
         )
-        return {"position": position, "scale": scale, **change_penalties(config, posed.aux)}
+        changes = {name: posed.aux[name].mean() for name in PENALTIES if name in posed.aux}
+        return {"position": position, "scale": scale, **changes}
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group per tensor."""
@@ -182,7 +173,7 @@ class GaussianAvatars(Avatar):
         if not self._changes:
             return None
         features = None if self.appearance is None else self.appearance.bake(self.store)
-        color, opacity_logits, means = (
+        means, color, opacity_logits = (
             as_array(self.store[name]) if name in self._basis_shapes() else None for name in BASES
         )
         rank = self.config.expression_rank

@@ -7,63 +7,18 @@ places. The network has no biases, so a Gaussian whose features are 0 does not c
 it is.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from mien.adam import FactoredGradient
 from mien.avatar.avatar import ParameterGroup, factored_group, network_group, store_group
 from mien.avatar.baking import as_array
-from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
-from mien.avatar.ops.feature_network import Layers, feature_network
+from mien.avatar.ops.feature_network import Layers
 from mien.avatar.settings import Rate
 from mien.avatar.store import GaussianStore
 from mien.runtime.baked import FeatureChanges
 
-_FEATURES = ("feature_color", "feature_opacity")
-"""Names of the changes by features."""
-BASES = ("color_basis", "opacity_basis", "offset_basis")
-"""Names of the bases of linear changes, which are also those of the changes."""
 APPEARANCE_WEIGHT = 0.1  # weight of the mean squared changes of colour and opacity by features
-
-
-def change_penalties(config: GaussianAvatarsConfig, changes: Mapping[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
-    """The weighted mean squared changes over all Gaussians: linear ones as `expression`, features' as `appearance`."""
-    kinds = (("expression", BASES, config.expression_weight), ("appearance", _FEATURES, APPEARANCE_WEIGHT))
-    losses = {}
-    for loss, names, weight in kinds:
-        chosen = [changes[name] for name in names if name in changes]
-        if chosen:
-            losses[loss] = mean_squares(weight, *chosen)
-    return losses
-
-
-def mean_squares(weight: float, *tensors: Tensor) -> Float[Tensor, ""]:
-    """The weighted sum of the mean squares of some tensors. Differentiable once."""
-    return _MeanSquares.apply(weight, *tensors)  # pyright: ignore[reportReturnType]
-
-
-class _MeanSquares(torch.autograd.Function):
-    """One pass over each tensor forward, and one backward. Autograd's own needs four, and memory for each."""
-
-    @staticmethod
-    def forward(ctx: Any, weight: float, *tensors: Tensor) -> Tensor:
-        ctx.weight = weight
-        ctx.save_for_backward(*tensors)
-        flat = [tensor.detach().flatten() for tensor in tensors]
-        return weight * torch.stack([torch.dot(own, own) / own.numel() for own in flat]).sum()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        factor = 2 * ctx.weight * grad_loss
-        return None, *(tensor * (factor / tensor.numel()) for tensor in ctx.saved_tensors)
-
-
 _OUTPUTS = 4  # three changes of colour, and one of opacity
 _HIDDEN = 32  # width of the only hidden layer
 _RATE = Rate(2.5e-3)  # learning rate of the features
@@ -83,25 +38,13 @@ class FeatureAppearance(nn.Module):
         self.last = nn.Linear(_HIDDEN, _OUTPUTS, bias=False).to(like)
         self.register_buffer("no_bias1", like.new_zeros(_HIDDEN), persistent=False)
         self.register_buffer("no_bias2", like.new_zeros(_OUTPUTS), persistent=False)
-        self._gradient = FactoredGradient()
-
-    def forward(
-        self, store: GaussianStore, activations: Float[Tensor, "f a"]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-        """Changes of the first SH coefficients and of the raw opacities, by the activations of each triangle.
-
-        Differentiable in all but the activations; native on a CPU. Poses are tuned without what changes with them: for
-        linear changes, their gradient made no difference (log, 11-22).
-        """
-        bases, neutral, rows = store["feature_bases"], store["neutral_features"], store["face_index"]
-        own = neutral.new_zeros(len(neutral), 0)
-        return feature_network(bases, activations, rows, neutral, own, self.layers(), self._gradient)
+        self.gradient = FactoredGradient()
 
     def parameter_groups(self, store: GaussianStore) -> list[ParameterGroup]:
         """The groups of the features and of the network."""
         return [
             store_group(store, "neutral_features", _RATE),
-            factored_group(store, "feature_bases", _RATE, self._gradient),
+            factored_group(store, "feature_bases", _RATE, self.gradient),
             network_group("appearance", self, _NETWORK_RATE),
         ]
 

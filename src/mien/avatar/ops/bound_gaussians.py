@@ -17,7 +17,10 @@ from mien.face.params import FaceParams
 from mien.face.posing import compiled_model, has_native_posing, head_poses
 from mien.gaussians import Gaussians
 
-_LOCAL = ("means", "quats", "log_scales", "opacity_logits")
+LOCAL = ("means", "quats", "log_scales", "opacity_logits")
+"""Names of the tensors of Gaussians in the frames of their triangles."""
+FACE_FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+"""Names of the parameters of a face that change from timestep to timestep."""
 
 
 def pose_bound_gaussians(
@@ -34,18 +37,30 @@ def pose_bound_gaussians(
     Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training, takes one
     native call forward and one backward.
     """
-    if len(face) == 1 and has_native_posing(face_model, face) and store["means"].dtype == torch.float32:
-        compiled = compiled_model(face_model)
-        rest = compiled.rest_shape(face_model, face)
-        if not rest[0].requires_grad:
-            topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
-            pose = (face.expression, face.joints, face.head_rotation, face.head_translation)
-            local = (store[name] for name in _LOCAL)
-            means, quats, scales, opacities, *head = _BoundGaussians.apply(
-                compiled.data, topology, in_head, *rest, *pose, *local
-            )
-            return Gaussians(means, quats, scales, opacities, sh, *head)
-    return pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
+    prepared = prepare_posing(face_model, face, store)
+    if prepared is None:
+        return pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
+    data, topology, inputs = prepared
+    means, quats, scales, opacities, *head = _BoundGaussians.apply(data, topology, in_head, *inputs)
+    return Gaussians(means, quats, scales, opacities, sh, *head)
+
+
+def prepare_posing(
+    face_model: FaceModel, face: FaceParams, store: Tensors
+) -> tuple[Any, _native.RigTopology, list[Tensor]] | None:
+    """Return the face model and the topology as the core takes them, and the ten tensors that a pose depends on.
+
+    None if the core cannot pose: more or fewer timesteps than one, a shape with a gradient, another dtype or device.
+    """
+    if len(face) != 1 or not has_native_posing(face_model, face) or store["means"].dtype != torch.float32:
+        return None
+    compiled = compiled_model(face_model)
+    rest = compiled.rest_shape(face_model, face)
+    if rest[0].requires_grad:
+        return None
+    topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
+    pose = (getattr(face, name) for name in FACE_FIELDS)
+    return compiled.data, topology, [*rest, *pose, *(store[name] for name in LOCAL)]
 
 
 def pose_bound_gaussians_reference(
@@ -57,7 +72,7 @@ def pose_bound_gaussians_reference(
 ) -> Gaussians:
     """`pose_bound_gaussians` composed from its parts, for any dtype, device and number of timesteps."""
     vertices = face_model.head_vertices(face) if in_head else face_model(face)
-    means, quats, log_scales, opacity_logits = (store[name] for name in _LOCAL)
+    means, quats, log_scales, opacity_logits = (store[name] for name in LOCAL)
     bound = bind_to_world(vertices, face_model.faces, store["face_index"], means, quats, log_scales)
     return Gaussians(*bound, sigmoid(opacity_logits), sh, head_poses(face) if in_head else None)
 

@@ -2,24 +2,24 @@
 
 A few activations describe the motion of each region of the face, and a few the head's pose (`ExpressionActivations`).
 Each Gaussian has a basis, whose product with the activations of its triangle is added to one of its raw values
-(`expression_change`). Not part of any of the three papers.
+(`mien.avatar.ops.changed_gaussians`). Not part of any of the three papers.
 """
 
+from itertools import zip_longest
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import is_native, native, recycled, unpacked
+from mien.arrays import is_native, unpacked
 from mien.avatar.ops.regions import region_shares, vertex_motions
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.baked import ExpressionChanges, HeadActivations
-from mien.runtime.posing import Face, activation_table, columns_of_activations
+from mien.runtime.posing import face_activations
 
 _EXPRESSIONS_BEYOND = 1.2
 """How far activations may go, relative to those of the training frames. 98 % of the held-out frames of wojtek go up to
@@ -83,6 +83,7 @@ class ExpressionActivations(nn.Module):
         }
         for name, value in values.items():
             self.register_buffer(name, value.detach().clone().contiguous())
+        self._compiled: tuple[list[tuple[int, int]], list[Tensor], _native.FaceActivations] | None = None
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
         # The number of rows comes from the frames, which are not there when an avatar is loaded.
@@ -95,10 +96,17 @@ class ExpressionActivations(nn.Module):
     @torch.no_grad()
     def forward(self, face: FaceParams) -> Float[Tensor, "f a"]:
         """The activations of each triangle at one timestep. They have no gradient; native for float32 on a CPU."""
-        parts = [part.detach() for part in (face.expression, face.joints, face.head_rotation, face.head_translation)]
+        parts = (face.expression, face.joints, face.head_rotation, face.head_translation)
         if not is_native(self.rest, *parts):
             return self.reference(face)
-        return torch.from_numpy(activation_table(self.record(), Face(*(part[0].numpy() for part in parts))))
+        buffers = [*self.buffers()]
+        versions = [(id(buffer), buffer._version) for buffer in buffers]
+        if self._compiled is None or self._compiled[0] != versions:
+            self._compiled = versions, buffers, face_activations(self.record())
+        known = self._compiled[2]
+        table = torch.empty(known.shape)
+        _native.activation_table(known, *unpacked(*parts, table))
+        return table
 
     def reference(self, face: FaceParams) -> Float[Tensor, "f a"]:
         """`forward` in plain PyTorch, any dtype and device."""
@@ -111,7 +119,9 @@ class ExpressionActivations(nn.Module):
         )
         pose = within_seen(head_motion(at_rest, face) @ self.head_directions, self.head_seen)
         table = torch.cat([own, pose.expand(regions, -1)], 1)
-        return self.shares @ table[:, columns_of_activations(block, pose.shape[1])]
+        own, of_pose = range(block), range(block, table.shape[1])
+        order = [column for pair in zip_longest(own, of_pose) for column in pair if column is not None]
+        return self.shares @ table[:, order]
 
     def record(self) -> ExpressionChanges:
         """The activations as a runtime takes them, without anything that they change."""
@@ -190,41 +200,3 @@ def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s ... r"]) ->
     over = (ratio - 1).clamp_min(0)
     shortened = (1 + MARGIN * over / (MARGIN + over)) / ratio.clamp_min(1)
     return values * torch.where(over > 0, shortened, 1.0)
-
-
-def expression_change_reference(
-    basis: Float[Tensor, "n ... r"], activations: Float[Tensor, "g r"], rows: Int[Tensor, " n"] | None
-) -> Float[Tensor, "n ..."]:
-    """`expression_change` in plain PyTorch, any dtype and device."""
-    own = activations[0] if rows is None else activations[rows].view(-1, *[1] * (basis.ndim - 2), basis.shape[-1])
-    return (basis * own).sum(-1)
-
-
-@native(expression_change_reference)
-def expression_change(
-    basis: Float[Tensor, "n ... r"], activations: Float[Tensor, "g r"], rows: Int[Tensor, " n"] | None
-) -> Float[Tensor, "n ..."]:
-    """The sum of a basis' columns, weighted by a Gaussian's row of activations, or the first of them without rows.
-
-    Differentiable in the basis; native for float32 on a CPU.
-    """
-    return _Change.apply(basis, activations, rows)
-
-
-class _Change(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, basis: Tensor, activations: Tensor, rows: Tensor | None) -> Tensor:
-        basis, activations = basis.detach().contiguous(), activations.detach().contiguous()
-        out = torch.empty(basis.shape[:-1])
-        _native.expression_change(*unpacked(basis, activations, rows, out))
-        ctx.shape, ctx.rows = basis.shape, rows
-        ctx.save_for_backward(activations)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        (activations,) = ctx.saved_tensors
-        by_basis = recycled(*ctx.shape)
-        _native.expression_change_backward(*unpacked(activations, ctx.rows, gradient.contiguous(), by_basis))
-        return by_basis, None, None
