@@ -68,11 +68,13 @@ mien::ExpressionBases checked_bases(const Basis& basis, const Values& values, co
                                     const std::optional<Rows>& rows) {
   require(values.ndim() >= 1 && basis.ndim() == values.ndim() + 1, "a basis must have one axis more than its values");
   const size_t rank = basis.shape(values.ndim()), count = values.shape(0);
-  require(rank <= activations.shape(1) && std::equal(values.shape_ptr(), values.shape_ptr() + values.ndim(), basis.shape_ptr()),
+  require(rank <= activations.shape(1) &&
+              std::equal(values.shape_ptr(), values.shape_ptr() + values.ndim(), basis.shape_ptr()),
           "a basis must have the shape of its values, followed by at most as many columns as activations");
   const int64_t each = count == 0 ? 0 : static_cast<int64_t>(values.size() / count);
-  return {static_cast<int64_t>(count), each, static_cast<int64_t>(rank), static_cast<int64_t>(activations.shape(1)),
-          activations.data(), checked_rows(rows, count, activations.shape(0))};
+  return {static_cast<int64_t>(count), each,
+          static_cast<int64_t>(rank),  static_cast<int64_t>(activations.shape(1)),
+          activations.data(),          checked_rows(rows, count, activations.shape(0))};
 }
 
 void expression_change(const Array<const float>& basis, const In<-1, -1>& activations, const std::optional<Rows>& rows,
@@ -89,8 +91,8 @@ void bind_expression_change(nb::module_& module) {
       .def_prop_ro("shape", [](const mien::FaceActivations& own) { return std::pair(own.rows(), own.width()); });
   module.def("make_face_activations", &make_face_activations, "rest"_a, "directions"_a, "seen"_a, "shares"_a.none(),
              "head_rest"_a.none(), "head_directions"_a.none(), "head_seen"_a.none(), "Copies the arrays.");
-  module.def("activation_table", &activation_table, "face"_a, "expression"_a, "joints"_a, "rotation"_a,
-             "translation"_a, "out"_a.noconvert(), "Fills the activations of all triangles.");
+  module.def("activation_table", &activation_table, "face"_a, "expression"_a, "joints"_a, "rotation"_a, "translation"_a,
+             "out"_a.noconvert(), "Fills the activations of all triangles.");
   module.def(
       "expression_change", &expression_change, "basis"_a.noconvert(), "activations"_a, "rows"_a.none(),
       "out"_a.noconvert(),

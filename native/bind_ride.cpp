@@ -27,8 +27,7 @@ struct KeptChanges {
   mien::Recycled<float> means, opacity_logits;
   std::optional<mien::Recycled<float>> features, hidden;
 
-  KeptChanges(size_t count, const mien::FeatureNetwork* network)
-      : means(3 * count), opacity_logits(count) {
+  KeptChanges(size_t count, const mien::FeatureNetwork* network) : means(3 * count), opacity_logits(count) {
     if (!network) return;
     features.emplace(count * static_cast<size_t>(network->features));
     hidden.emplace(count * static_cast<size_t>(mien::hidden_stride(network->hidden)));
@@ -153,9 +152,12 @@ struct ChangeArrays {
     const size_t count = topology.face_index.size(), width = activations.shape(1);
     require(sh.shape(0) == count && activations.shape(0) == topology.faces.size() / 3,
             "there must be coefficients for each Gaussian, and activations for each triangle");
-    if (offset_basis) rank = offset_basis->shape(2);
-    else if (color_basis) rank = color_basis->shape(2);
-    else if (opacity_basis) rank = opacity_basis->shape(1);
+    if (offset_basis)
+      rank = offset_basis->shape(2);
+    else if (color_basis)
+      rank = color_basis->shape(2);
+    else if (opacity_basis)
+      rank = opacity_basis->shape(1);
     require(rank <= width && (!offset_basis || has_shape(*offset_basis, count, 3, rank)) &&
                 (!color_basis || has_shape(*color_basis, count, 3, rank)) &&
                 (!opacity_basis || has_shape(*opacity_basis, count, rank)),
@@ -171,24 +173,39 @@ struct ChangeArrays {
                 has_shape(*weight1, hidden, features) && has_shape(*weight2, 4, hidden),
             "features and layers do not fit each other");
     no_biases.assign(hidden + 4, 0.0f);
-    network = {static_cast<int64_t>(count), static_cast<int>(features), 0, static_cast<int>(hidden), 4,
-               neutral->data(), nullptr, weight1->data(), no_biases.data(), weight2->data(),
+    network = {static_cast<int64_t>(count),
+               static_cast<int>(features),
+               0,
+               static_cast<int>(hidden),
+               4,
+               neutral->data(),
+               nullptr,
+               weight1->data(),
+               no_biases.data(),
+               weight2->data(),
                no_biases.data() + hidden};
   }
   mien::ChangeBases bases(const mien::RigTopology& topology) const {
     const auto width = static_cast<int64_t>(activations.shape(1));
     const int64_t* const rows = topology.face_index.data();
-    return {static_cast<int64_t>(sh.shape(0)), static_cast<int64_t>(rank), data_of(offset_basis),
-            data_of(color_basis), data_of(opacity_basis), activations.data(), width, rows,
-            neutral ? &network : nullptr, {data_of(feature_bases), width, activations.data(), rows}};
+    return {static_cast<int64_t>(sh.shape(0)),
+            static_cast<int64_t>(rank),
+            data_of(offset_basis),
+            data_of(color_basis),
+            data_of(opacity_basis),
+            activations.data(),
+            width,
+            rows,
+            neutral ? &network : nullptr,
+            {data_of(feature_bases), width, activations.data(), rows}};
   }
 };
 
 // The changed coefficients, the changes, and the weighted mean squares of the linear ones and of the features'.
 struct ChangedArrays {
   static constexpr char kName[] = "ChangedArrays";
-  static constexpr const char* kFields[] = {"sh",           "offset",          "color",  "opacity",
-                                            "feature_color", "feature_opacity", "linear", "features"};
+  static constexpr const char* kFields[] = {"sh",     "offset",  "color", "opacity", "feature_color", "feature_opacity",
+                                            "linear", "features"};
   Out<-1, 1, 3> sh;
   MaybeOut<-1, 3> offset, color;
   MaybeOut<-1> opacity;
@@ -218,8 +235,8 @@ struct ChangedArrays {
 // The gradients of what `ChangedArrays` holds. Each may be missing.
 struct ByChangedArrays {
   static constexpr char kName[] = "ByChangedArrays";
-  static constexpr const char* kFields[] = {"sh",           "offset",          "color",  "opacity",
-                                            "feature_color", "feature_opacity", "linear", "features"};
+  static constexpr const char* kFields[] = {"sh",     "offset",  "color", "opacity", "feature_color", "feature_opacity",
+                                            "linear", "features"};
   MaybeIn<-1, 1, 3> sh;
   MaybeIn<-1, 3> offset, color;
   MaybeIn<-1> opacity;
@@ -298,9 +315,8 @@ void change(const Rider& rider, const ChangeArrays& own, const ChangedArrays& ch
   const mien::ChangeBases bases = own.bases(rider.topology);
   ride.changes.emplace(rider.count(), bases.network);
   const mien::ChangeSquares squares = mien::change_gaussians(
-      bases, ride.changes->kept(),
-      {rider.local.means.data(), rider.local.opacity_logits.data(), own.sh.data()}, changed.changes(),
-      {ride.changes->means.data(), ride.changes->opacity_logits.data(), changed.sh.data()});
+      bases, ride.changes->kept(), {rider.local.means.data(), rider.local.opacity_logits.data(), own.sh.data()},
+      changed.changes(), {ride.changes->means.data(), ride.changes->opacity_logits.data(), changed.sh.data()});
   *changed.linear.data() = weights.first * static_cast<float>(squares.linear);
   *changed.features.data() = weights.second * static_cast<float>(squares.features);
 }
@@ -375,8 +391,9 @@ void backward(const Ride& ride, const mien::FaceModelData& model, const mien::Ri
 
 // Fills the gradients of bases, features and layers, from those that `backward` filled of the changed Gaussians.
 void changes_backward(const Ride& ride, const mien::RigTopology& topology, const Group<ChangeArrays>& change_group,
-                      const Group<ChangedArrays>& changed_group, std::pair<float, float> weights, const In<-1, 3>& by_means,
-                      const In<-1>& by_opacity_logits, const Group<ByChangedArrays>& by_changed_group,
+                      const Group<ChangedArrays>& changed_group, std::pair<float, float> weights,
+                      const In<-1, 3>& by_means, const In<-1>& by_opacity_logits,
+                      const Group<ByChangedArrays>& by_changed_group,
                       const Group<ChangeGradientArrays>& gradient_group) {
   const size_t count = topology.face_index.size();
   require(ride.topology == &topology && ride.changes.has_value(), "the ride belongs to another topology");
@@ -395,9 +412,16 @@ void changes_backward(const Ride& ride, const mien::RigTopology& topology, const
   mien::change_gaussians_backward(
       bases, ride.changes->kept(),
       {values.offset, values.color, values.opacity, values.feature_color, values.feature_opacity},
-      {{by_means.data(), by_opacity_logits.data(), data_of(by.sh)}, by.changes(), linear, features,
-       data_of(out.offset_basis), data_of(out.color_basis), data_of(out.opacity_basis), data_of(out.features),
-       data_of(out.weight1), data_of(out.weight2)});
+      {{by_means.data(), by_opacity_logits.data(), data_of(by.sh)},
+       by.changes(),
+       linear,
+       features,
+       data_of(out.offset_basis),
+       data_of(out.color_basis),
+       data_of(out.opacity_basis),
+       data_of(out.features),
+       data_of(out.weight1),
+       data_of(out.weight2)});
 }
 
 }  // namespace

@@ -22,7 +22,8 @@ const float* activations_of(const ChangeBases& bases, int64_t index) {
   return bases.activations + bases.rows[index] * bases.width;
 }
 
-// `width` values of one Gaussian from its basis [width, r]. Sums run in the order of the activations, as in the runtime.
+// `width` values of one Gaussian from its basis [width, r]. Sums run in the order of the activations, as in the
+// runtime.
 void linear_change(const ChangeBases& bases, const float* basis, int64_t index, int width, float* out) {
   const float *activations = activations_of(bases, index), *own = basis + index * width * bases.rank;
   for (int value = 0; value < width; ++value, own += bases.rank) {
@@ -132,7 +133,8 @@ void change_gaussians_backward(const ChangeBases& bases, const FeatureKept& kept
       basis_gradient(bases, rows, begin, end, 3, gradients.color_basis);
     }
     if (bases.opacity) {
-      gradient_of_change(gradients.changed.opacity_logits, by.opacity, changes.opacity, of_numbers, begin, end, numbers);
+      gradient_of_change(gradients.changed.opacity_logits, by.opacity, changes.opacity, of_numbers, begin, end,
+                         numbers);
       basis_gradient(bases, numbers, begin, end, 1, gradients.opacity_basis);
     }
     if (bases.network) {

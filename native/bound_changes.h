@@ -20,10 +20,10 @@ struct GaussianChanges {
 
 // Each of the first three may be null: then nothing changes linearly. `network` is null without features.
 struct ChangeBases {
-  int64_t count, rank;     // n, and r: the number of activations that the bases take, the first of a row
-  const float* offset;     // [n, 3, r]
-  const float* color;      // [n, 3, r]
-  const float* opacity;    // [n, r]
+  int64_t count, rank;       // n, and r: the number of activations that the bases take, the first of a row
+  const float* offset;       // [n, 3, r]
+  const float* color;        // [n, 3, r]
+  const float* opacity;      // [n, r]
   const float* activations;  // [.., width]
   int64_t width;
   const int64_t* rows;  // [n]
@@ -48,11 +48,11 @@ ChangeSquares change_gaussians(const ChangeBases& bases, const FeatureKept& kept
                                const GaussianChanges<float>& changes, const RawGaussians<float>& changed);
 
 struct ChangeGradients {
-  RawGaussians<const float> changed;        // of the changed Gaussians; sh may be null
-  GaussianChanges<const float> changes;     // of the changes themselves; each may be null
-  float linear, features;                   // of the two sums of squares
+  RawGaussians<const float> changed;                  // of the changed Gaussians; sh may be null
+  GaussianChanges<const float> changes;               // of the changes themselves; each may be null
+  float linear, features;                             // of the two sums of squares
   float *offset_basis, *color_basis, *opacity_basis;  // written, as far as there are such bases
-  float *by_features, *weight1, *weight2;   // the same, of the features and of the network's two layers
+  float *by_features, *weight1, *weight2;             // the same, of the features and of the network's two layers
 };
 // Fills the gradients, from the changes that `change_gaussians` filled.
 void change_gaussians_backward(const ChangeBases& bases, const FeatureKept& kept,

@@ -103,8 +103,10 @@ void activation_table(const FaceActivations& face, const float* inputs, const fl
       if (k < of_head) *to++ = head[k];
     }
   }
-  if (face.shares.empty()) std::copy(table.begin(), table.end(), out);
-  else blend_regions(face, table.data(), out);
+  if (face.shares.empty())
+    std::copy(table.begin(), table.end(), out);
+  else
+    blend_regions(face, table.data(), out);
 }
 
 void expression_change(const ExpressionBases& bases, const float* basis, float* out) {

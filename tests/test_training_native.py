@@ -2,7 +2,7 @@
 A table has them all. tests/test_feature_network.py, tests/test_point_avatar.py and others hold what is special."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -14,10 +14,12 @@ import test_feature_network as features
 import test_point_avatar as points
 from instruction_sets import by_threads
 from mien import _native
-from mien.adam import FactoredMoments, FactoredTerm
+from mien.adam import FactoredGradient, FactoredMoments, FactoredTerm
 from mien.avatar.avatar import ParameterGroup
+from mien.avatar.ops import changed_gaussians as changing
 from mien.avatar.ops.activation import sigmoid
-from mien.avatar.ops.expression_changes import expression_change, expression_change_reference
+from mien.avatar.ops.bound_gaussians import FACE_FIELDS, LOCAL
+from mien.avatar.ops.feature_network import Layers
 from mien.avatar.ops.skin_points import skin_points, skin_points_reference
 from mien.avatar.ops.surface_limits import keep_on_surface, keep_on_surface_reference, limits_of_triangles, pull_colors
 from mien.avatar.ops.triangle_frames import bind_to_world
@@ -27,7 +29,7 @@ from mien.avatar.store import GaussianStore, Moments
 from mien.training import adam as updates
 from mien.training.density_control.gradient import observe_reference
 from mien.training.losses import alpha_loss, alpha_loss_reference
-from toy_scene import random
+from toy_scene import random, toy_face, toy_face_model
 
 Tensors = list[Tensor]
 
@@ -229,12 +231,44 @@ def limited(given: Tensors, native: bool, pulled: bool) -> Tensors:
     return [store[name].detach() for name in names]
 
 
-def changed(given: Tensors, native: bool) -> Tensors:
-    """Changes by rows of activations, and the gradient of the bases."""
-    basis, activations = given[0].clone().requires_grad_(), given[1]
-    rows = features.places(activations, len(basis))
-    values = (expression_change if native else expression_change_reference)(basis, torch.atleast_2d(activations), rows)
-    return [values.detach(), *torch.autograd.grad(values, basis, random(*values.shape, seed=9).to(values))]
+def change_inputs(count: int) -> Tensors:
+    """Activations of triangles, then for each Gaussian its triangle, its values, its three bases, and its features with
+    the layers of their network. Some features are 0."""
+    triangles = len(toy_face_model().faces)
+    index = torch.randint(0, triangles, (count,), generator=torch.Generator().manual_seed(1))
+    shapes = ((3,), (4,), (3,), (), (1, 3), (3, 2), (3, 2), (2,), (6,), (5, 6))
+    own = [0.5 * random(count, *shape, seed=seed) for seed, shape in enumerate(shapes)]
+    own[-1][::3] = own[-2][::3] = 0
+    return [random(triangles, 5), index, *own, random(20, 6, seed=20), random(4, 20, seed=21)]
+
+
+def changed(given: Tensors, native: bool, bases: tuple[str, ...], featured: bool, in_head: bool) -> Tensors:
+    """Posed Gaussians, their changes and penalties, and gradients of a loss that weighs every number differently."""
+    names = (*LOCAL, "sh", *changing.BASES, "neutral_features", "feature_bases", "weight1", "weight2")
+    leaves = {name: own.clone().requires_grad_() for name, own in zip(names, given[2:], strict=True)}
+    model, face = toy_face_model(), toy_face(3)[1].detach()
+    like, weights = given[2], (leaves["weight1"], leaves["weight2"])
+    model, face = model.to(like), face.to(like)
+    for name in FACE_FIELDS:
+        leaves[name] = getattr(face, name).clone().requires_grad_()
+    face, gradient = replace(face, **{name: leaves[name] for name in FACE_FIELDS}), FactoredGradient()
+    layers = Layers(weights[0], like.new_zeros(20), weights[1], like.new_zeros(4)) if featured else None
+    changes = changing.Changes(given[0], bases, layers, gradient, (3.0, 0.1))
+    pose = changing.pose_changed_gaussians if native else changing.pose_changed_gaussians_reference
+    posed, found = pose(model, face, leaves | {"face_index": given[1]}, leaves["sh"], in_head, changes)
+    parts = [
+        posed.means,
+        posed.quats,
+        posed.scales,
+        posed.opacities,
+        posed.sh,
+        *(found[name] for name in sorted(found)),
+    ]
+    parts += [posed.T_world_local] if posed.T_world_local is not None else []
+    loss = torch.stack([part.flatten() @ random(part.numel(), seed=9).to(part) for part in parts]).sum()
+    gradients = torch.autograd.grad(loss, [*leaves.values()], allow_unused=True)
+    terms = [features.product(*term) for term in gradient.take()]
+    return [*(part.detach() for part in parts), *(own for own in gradients if own is not None), *terms]
 
 
 def both(native: Callable[..., Tensor], reference: Callable[..., Tensor]) -> Callable[[Tensors, bool], Tensors]:
@@ -259,7 +293,6 @@ def compare_activated(index: int, own: Tensor, truth: Tensor) -> None:
 
 
 COUNTS, PICTURES = (0, 1, 15, 16, 4097), ((1, 1), (7, 5), (40, 130), (200, 301))
-CHANGES = tuple(((*n, k), k % 3) for n in ((0,), (1,), (17, 3), (9000, 3)) for k in range(1, 9))
 KERNELS = {
     # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
     "adam": Kernel(lambda n: [0.1 * random(n, seed=1), random(n, seed=2).square(), random(n, seed=3), random(n)],
@@ -281,8 +314,14 @@ KERNELS = {
     "pulled": Kernel(limited_inputs, partial(limited, pulled=True), (0, 1, 5000), 5000, near(1e-5, 1e-6)),
     "features": Kernel(lambda size: [*features.arguments(size), *features.gradients_of(size)], feature_network,
                        tuple(features.SIZES), features.SIZES[3], near_by_norm(1e-5)),
-    "changes": Kernel(lambda size: [random(*size[0]), features.table(size[1], size[0][-1], 1)], changed, CHANGES,
-                      ((20_000, 3, 8), 5), near(1e-4, 1e-4)),
+    **{
+        f"changes{number}": Kernel(change_inputs, partial(changed, bases=bases, featured=featured, in_head=in_head),
+                                   (1, 17, 5000), 20_000, near_by_norm(1e-5))
+        for number, (bases, featured, in_head) in enumerate((
+            (("offset_basis",), True, True), (changing.BASES, True, False), (changing.BASES, False, True),
+            ((), True, True),
+        ))
+    },
     "sigmoid": Kernel(lambda count: [8 * random(count)], both(sigmoid, torch.sigmoid), (0, 1, 15, 17, 40_001), 50_000,
                       compare_activated),
     **{

@@ -2,6 +2,7 @@
 // for any number of threads, with inputs for all Gaussians and with tables of them.
 #include <algorithm>
 
+#include "bound_changes.h"
 #include "checks.h"
 #include "expression_change.h"
 #include "feature_network.h"
@@ -139,37 +140,68 @@ void check_update() {
   }
 }
 
-Floats changes(int64_t count, int64_t values, int64_t rank, bool by_row) {
+Floats table_of(int64_t rank, Random& random) {
+  mien::FaceActivations face;
+  face.own = {random.normal(11), random.normal(11 * rank * kTable), random.normal(4 * rank * kTable), rank * kTable,
+              rank};
+  face.head_rest = random.normal(6);
+  face.head = {Floats(6), random.normal(6 * 2), random.normal(3 * 2), 2, 2};
+  face.shares = random.uniform(kTable * kTable);
+  const Floats inputs = random.normal(11), pose = random.normal(6);
+  Floats table(kTable * face.width());
+  mien::activation_table(face, inputs.data(), pose.data(), table.data());
+  return table;
+}
+
+// Linear changes as the runtime computes them, then those of training with their gradients.
+Floats changes(int64_t count, int64_t rank) {
   Random random(7);
-  const Floats inputs = random.normal(11), rest = random.normal(11), directions = random.normal(11 * rank * kTable);
-  const Floats seen = random.normal(4 * rank * kTable), shares = random.uniform(count * kTable);
-  Floats own(rank * kTable), table(count * rank), motion(6);
-  mien::expression_activations({inputs.data(), 11, rest.data(), directions.data(), rank * kTable, rank, seen.data(), 4},
-                               own.data());
-  mien::blend_regions(shares.data(), own.data(), count, kTable, rank, table.data());
-  mien::head_motion(rest.data(), inputs.data(), motion.data());
+  const int64_t width = rank + 2;
+  const Floats table = table_of(rank, random), basis = random.normal(count * 3 * rank);
   const std::vector<int64_t> rows = rows_of(count, random);
-  const Floats& activations = by_row ? own : table;
-  const mien::ExpressionBases bases{count, values, rank, activations.data(), by_row ? rows.data() : nullptr};
-  const Floats basis = random.normal(count * values * rank);
-  Floats out(count * values), gradient(basis.size());
-  mien::expression_change(bases, basis.data(), out.data());
-  mien::expression_change_backward(bases, out.data(), gradient.data());
-  out.insert(out.end(), gradient.begin(), gradient.end());
-  out.insert(out.end(), motion.begin(), motion.end());
-  return out;
+  Floats alone(count * 3), offset(count * 3), color(count * 3), opacity(count), means(count * 3), sh(count * 3);
+  Floats logits(count), by_basis(basis.size()), by_features(count * 5), by_weight1(7 * 5), by_weight2(4 * 7);
+  mien::expression_change({count, 3, rank, width, table.data(), rows.data()}, basis.data(), alone.data());
+
+  const Floats neutral = random.normal(count * 5), bases = random.normal(count * width * 5),
+               weight1 = random.normal(35);
+  const Floats weight2 = random.normal(28), none(11), raw = random.normal(count * 3), by = random.normal(count * 3);
+  const mien::FeatureNetwork network{
+      count, 5, 0, 7, 4, neutral.data(), nullptr, weight1.data(), none.data(), weight2.data(), none.data()};
+  const mien::ChangeBases own{
+      count,        rank,  basis.data(), nullptr,  nullptr,
+      table.data(), width, rows.data(),  &network, {bases.data(), width, table.data(), rows.data()}};
+  Floats features(count * 5), hidden(count * mien::hidden_stride(7));
+  const mien::FeatureKept kept{features.data(), hidden.data()};
+  const mien::ChangeSquares squares = mien::change_gaussians(
+      own, kept, {raw.data(), raw.data(), raw.data()}, {offset.data(), nullptr, nullptr, color.data(), opacity.data()},
+      {means.data(), logits.data(), sh.data()});
+  CHECK(alone == offset);
+  mien::change_gaussians_backward(own, kept, {offset.data(), nullptr, nullptr, color.data(), opacity.data()},
+                                  {{by.data(), by.data(), by.data()},
+                                   {},
+                                   3.0f,
+                                   0.1f,
+                                   by_basis.data(),
+                                   nullptr,
+                                   nullptr,
+                                   by_features.data(),
+                                   by_weight1.data(),
+                                   by_weight2.data()});
+  Floats all{static_cast<float>(squares.linear), static_cast<float>(squares.features)};
+  for (const Floats* each : {&alone, &means, &logits, &sh, &by_basis, &by_features, &by_weight1, &by_weight2})
+    all.insert(all.end(), each->begin(), each->end());
+  return all;
 }
 
 void check_changes() {
   for (int64_t count : {1, 5, 9000}) {
     for (int64_t rank : {1, 3, 11}) {
-      for (bool by_row : {false, true}) {
-        mien::set_thread_count(1);
-        const Floats serial = changes(count, rank == 3 ? 1 : 3, rank, by_row);
-        CHECK(all_finite(serial));
-        mien::set_thread_count(3);
-        CHECK(changes(count, rank == 3 ? 1 : 3, rank, by_row) == serial);
-      }
+      mien::set_thread_count(1);
+      const Floats serial = changes(count, rank);
+      CHECK(all_finite(serial));
+      mien::set_thread_count(3);
+      CHECK(changes(count, rank) == serial);
     }
   }
 }

@@ -166,16 +166,46 @@ def rig_backward(c: Call) -> Arguments:
     return c.given(topology, vertices, local, frames, posed.scales, by_world, *outputs)
 
 
+def face_activations(c: Call) -> Arguments:
+    """Return the arrays of `make_face_activations`, for j coefficients and one joint."""
+    shares = c.maybe(c.array("t a"))
+    regions = 1 if shares is None else c.size("a")
+    own = [c.array("j+3"), *(c.array(f"{rows} {regions}*r") for rows in ("j+3", "k"))]
+    return [*own, shares, *(c.maybe(c.given("6", "6 p", "k p"), 0.7) or [None] * 3)]
+
+
 def ride(c: Call) -> Arguments:
     topology = c.make_rig_topology(c.size("v"), "<v t 3", "<t n")
     face = c.FaceArrays("v 3", "j+1 3", "1 e", "1 j 3", "1 3", "1 3")
     posed = c.PosedGaussians("=1 n 3", "=1 n 4", "=1 n 3", "=n", "=1 4 4")
     local = c.LocalGaussians("n 3", "n 4", "n 3", "n")
-    return [c.make_face_model(*make_face_model(c)), topology, c.flag(), face, local, posed]
+    model, changed = c.make_face_model(*make_face_model(c)), c.maybe(changes(c))
+    return [model, topology, c.flag(), face, local, posed, *(changed or [])]
+
+
+def changes(c: Call) -> Arguments:
+    """Return what changes the Gaussians of a ride, the arrays that are filled, and weights."""
+    offset, color, opacity, features = (c.flag() for _ in range(4))
+    kinds = [("n 3 r", "n 3", offset), ("n 3 r", "n 3", color), ("n r", "n", opacity)]
+    network = ["n f", "n r+a f", "h f", "4 h"] if features else [None] * 4
+    of_features = ["=n 3", "=n"] if features else [None] * 2
+    arrays = c.ChangeArrays("n 1 3", "t r+a", *(basis if there else None for basis, _, there in kinds), *network)
+    found = ("=" + change if there else None for _, change, there in kinds)
+    return [arrays, c.ChangedArrays("=n 1 3", *found, *of_features, "=", "="), (3.0, 0.1)]
+
+
+def ride_changes_backward(c: Call) -> Arguments:
+    given, (arrays, changed, weights) = ride(c)[:6], changes(c)
+    own = c.native.ride(*given, arrays, changed, weights)
+    shapes = ("n 1 3", "n 3", "n 3", "n", "n 3", "n", "=", "=")
+    by_changed = c.ByChangedArrays(*(c.maybe(c.array(shape), 0.7) for shape in shapes))
+    written = [arrays.offset_basis, arrays.color_basis, arrays.opacity_basis, arrays.neutral, *arrays[7:]]
+    gradients = c.ChangeGradients(*(None if one is None else np.zeros_like(one) for one in written))
+    return [own, given[1], arrays, changed, weights, *c.given("n 3", "n"), by_changed, gradients]
 
 
 def ride_backward(c: Call) -> Arguments:
-    model, topology, in_head, face, local, posed = ride(c)
+    model, topology, in_head, face, local, posed = ride(c)[:6]
     own = c.native.ride(model, topology, in_head, face, local, posed)
     by_posed = c.PosedGaussians("1 n 3", "1 n 4", "1 n 3", "n", "1 4 4")
     by_local = c.LocalGaussians("=n 3", "=n 4", "=n 3", "=n")
@@ -263,6 +293,8 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "absolute_difference": lambda c: c.given("H W", "<256 H W:u1", 0.5, "=H W", "="),
     "activate_points": lambda c: [
         c.RawPoints("n 11", "n 3", "n 4", "n", "n 3"), 0.5, 0.1, c.ActivatedPoints("=n 3", "=n 4", "=n", "=n 1 3")],
+    "activation_table": lambda c: [
+        own := c.make_face_activations(*face_activations(c)), *c.given("j", "3", "3", "3"), np.zeros(own.shape, F32)],
     "adam_update": lambda c: [[
         Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01) for _ in range(c.size("a"))]],
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
@@ -273,26 +305,23 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "bake_texture": lambda c: sighting(
         c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")),
     "barycentric_backward": lambda c: c.given(*fragments(c), "H W 3", "=V 3:f8"),
-    "blend_regions": lambda c: c.given("n r", "r k", "=n k"),
     "box_of_nonzero": lambda c: [np.maximum(c.array("H W") - 2, 0)],
     "clear_rows": lambda c: [c.array("<2 n:u1"), c.given("n", "n 3", "n 2 4")],
     "compose_rigid": lambda c: c.given("4 4", "4 4", "=4 4"),
     "compose_rigid_backward": lambda c: c.given("4 4", "4 4", "4 4", "=4 4", "=4 4"),
     "composite": lambda c: c.given("<256 H W 3:u1", "<256 H W:u1", [1, 2, 255], c.box(), "=H W 3:u1"),
-    "expression_activations": lambda c: c.given("i", "i", "i a*r", "k a*r", c.size("r"), "=a*r"),
     "expression_change": lambda c: c.given("n 3? r", "a r", "?<a n", "=n 3?"),
-    "expression_change_backward": lambda c: c.given("a r", "?<a n", "n 3?", "=n 3? r"),
     "factored_adam_update": lambda c: factored(c, "n k f", "+n k f", steps(c)),
     "factored_update": lambda c: factored(c, "+n f", "+n"),
     "feature_network": lambda c: c.given(*network(c), c.maybe(c.FeatureKept("=n f", "=n h^")), "=n o", "=n"),
     "feature_network_backward": feature_network_backward,
-    "head_motion": lambda c: c.given("6", "6", "=6"),
     "head_poses": lambda c: c.given("n 3", "n 3", "=n 4 4"),
     "head_poses_backward": lambda c: c.given("n 3", "n 4 4", "=n 3"),
     "interpolate_mesh": lambda c: c.given(*drawn(c), "V c", "<V t 3", "=H W c"),
     "interpolate_mesh_backward": lambda c: c.given(*drawn(c), "V c", "<V t 3", "H W c", "=V c", "=H W 3"),
     "keep_on_surface": lambda c: c.given("<r n", "r 5", 1.6, "n 3", "n 4", "n 3", "?r 4", "n 3"),
     "light_equations": lambda c: sighting(c, "=3 9 9:f8", "=3 9:f8"),
+    "make_face_activations": lambda c: c.given(*face_activations(c)),
     "make_face_model": make_face_model,
     "make_rig_topology": lambda c: c.given(c.size("v"), "<v t 3", "<t n"),
     "mean_squared_difference": lambda c: c.given("H W 3", "<256 H W 3:u1"),
@@ -312,6 +341,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "recycled": lambda c: [[c.size("n"), c.size("m")]],
     "ride": ride,
     "ride_backward": ride_backward,
+    "ride_changes_backward": ride_changes_backward,
     "rig_backward": rig_backward,
     "rig_forward": rig_forward,
     "sample_texture": lambda c: c.given("H W d", "n 2", "=n d"),

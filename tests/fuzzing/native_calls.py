@@ -35,7 +35,7 @@ SECONDS_A_CALL = 20
 MOST_FINDINGS = 20
 SETTINGS_FOR = 50
 """Number of consecutive calls with the same number of threads and the same instruction set."""
-STRANGERS = ("ride_backward", "rasterize_views_backward", "align_mesh", "pose_face")
+STRANGERS = ("ride_backward", "rasterize_views_backward", "align_mesh", "pose_face", "activation_table")
 """Functions whose arguments are passed to others. Together they take every class."""
 
 
@@ -55,7 +55,7 @@ def load(path: str) -> Any:
 
 def bound_names(native: Any) -> set[str]:
     """Return the names of everything that can be called, except for classes that only functions make, and groups."""
-    made = {"FaceModelData", "RigTopology", "Ride", "RasterizeFrame"}
+    made = {"FaceActivations", "FaceModelData", "RigTopology", "Ride", "RasterizeFrame"}
     named = {name: getattr(native, name) for name in dir(native) if not name.startswith("_")}
     return {name for name, one in named.items() if callable(one) and not hasattr(one, "_fields")} - made
 
