@@ -55,7 +55,7 @@ def native(reference: Callable[..., Any]) -> Callable[[_Operation], _Operation]:
 
 
 def unpacked(*tensors: Tensor | None) -> list[Any]:
-    """CPU tensors that need no gradient, in the form in which the core takes them; None stays None.
+    """CPU tensors in the form in which the core takes them, whether they need a gradient or not; None stays None.
 
     The core would otherwise call `__dlpack__` of each tensor itself. That takes ten times as long, 2 us, and happens a
     hundred times per training step. Use it only for functions with a single signature: each capsule can be consumed

@@ -123,7 +123,7 @@ class _ComposeRigid(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
-        first, second = first.detach().contiguous(), second.detach().contiguous()
+        first, second = first.contiguous(), second.contiguous()
         ctx.save_for_backward(first, second)
         if first.dtype == torch.float32 and first.device.type == "cpu":
             out = torch.empty_like(first)

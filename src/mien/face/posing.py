@@ -48,9 +48,9 @@ def head_poses(face: FaceParams) -> Float[Tensor, "b 4 4"]:
 class _HeadPoses(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rotation: Tensor, translation: Tensor) -> Tensor:
-        rotation = rotation.detach().contiguous()
+        rotation = rotation.contiguous()
         transforms = rotation.new_empty(len(rotation), 4, 4)
-        _native.head_poses(rotation, translation.detach().contiguous(), transforms)
+        _native.head_poses(*unpacked(rotation, translation.contiguous(), transforms))
         ctx.save_for_backward(rotation)
         return transforms
 
@@ -108,7 +108,7 @@ class _PoseVertices(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, data: Any, *inputs: Tensor | None) -> Tensor:
         rest, joint_rest, expression, joints, rotation, translation = (
-            None if tensor is None else tensor.detach().contiguous() for tensor in inputs
+            None if tensor is None else tensor.contiguous() for tensor in inputs
         )
         assert rest is not None
         assert joint_rest is not None
@@ -130,8 +130,7 @@ class _PoseVertices(torch.autograd.Function):
         grad_rest, grad_joint_rest = rest.new_empty(b, *rest.shape), rest.new_empty(b, *joint_rest.shape)
         grad_expression, grad_joints = torch.empty_like(expression), torch.empty_like(joints)
         grad_head = rest.new_empty(b, 3), rest.new_empty(b, 3)
-        inputs = (None if array is None else array.detach() for array in (*arrays, shaped))
-        known = unpacked(*inputs, grad_vertices.contiguous())
+        known = unpacked(*arrays, shaped, grad_vertices.contiguous())
         found = unpacked(grad_rest, grad_joint_rest, grad_expression, grad_joints, *grad_head)
         face, gradients = _native.FaceArrays(*known[:6]), _native.FaceArrays(*found)
         _native.pose_face_backward(ctx.data, face, known[6], known[7], gradients)

@@ -105,12 +105,12 @@ class _PhotometricLoss(torch.autograd.Function):
         parts: Sequence[Box], part_weight: float,
     ) -> Tensor:  # fmt: skip
         gradient = recycled(*image.shape) if ctx.needs_input_grad[0] else None
-        drawn = None if drawn is None else drawn.detach().contiguous()
+        drawn = None if drawn is None else drawn.contiguous()
         loss = torch.empty(())
-        pictures = unpacked(image.detach().contiguous(), target.contiguous(), drawn, gradient, loss)
+        pictures = unpacked(image.contiguous(), target.contiguous(), drawn, gradient, loss)
         _native.photometric_loss(box, weights, *pictures)
         for part in parts:
-            loss += _add_part(part, image.detach(), target, weights, part_weight, gradient)
+            loss += _add_part(part, image, target, weights, part_weight, gradient)
         ctx.save_for_backward(gradient)
         return loss
 
@@ -200,7 +200,7 @@ class _AlphaLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Tensor:
         gradient, loss = recycled(*alpha.shape), torch.empty(())
-        values, target, *filled = unpacked(alpha.detach().contiguous(), matte.contiguous(), gradient, loss)
+        values, target, *filled = unpacked(alpha.contiguous(), matte.contiguous(), gradient, loss)
         _native.absolute_difference(values, target, weight, *filled)
         ctx.save_for_backward(gradient)
         return loss

@@ -20,7 +20,7 @@ def sigmoid(values: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
 class _Sigmoid(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        values = values.detach().contiguous()
+        values = values.contiguous()
         out = torch.empty_like(values)
         _native.sigmoid(*unpacked(values, out))
         ctx.save_for_backward(out)

@@ -80,7 +80,7 @@ def pose_bound_gaussians_reference(
 class _BoundGaussians(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
-        arrays = [tensor.detach().contiguous() for tensor in inputs]
+        arrays = [tensor.contiguous() for tensor in inputs]
         count = len(arrays[-1])
         means, quats, scales = (torch.empty(1, count, width) for width in (3, 4, 3))
         opacities, head_pose = torch.empty(count), torch.empty(1, 4, 4)
@@ -101,7 +101,7 @@ class _BoundGaussians(torch.autograd.Function):
         of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:]]
         head_pose = () if ctx.in_head else (None,)
         by_posed = (*(gradient.contiguous() for gradient in gradients), *head_pose)
-        known = unpacked(*saved, *by_posed, *of_gaussians, scales.detach(), opacities.detach())
+        known = unpacked(*saved, *by_posed, *of_gaussians, scales, opacities)
         _native.ride_backward(
             ctx.ride,
             ctx.data,

@@ -103,7 +103,7 @@ class _Blend(torch.autograd.Function):
 class _Network(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gradient: FactoredGradient, rows: Tensor | None, *arguments: Tensor) -> tuple[Tensor, Tensor]:
-        bases, inputs, neutral, *rest = (tensor.detach().contiguous() for tensor in arguments)
+        bases, inputs, neutral, *rest = (tensor.contiguous() for tensor in arguments)
         n, outputs = len(neutral), len(rest[-1])
         last, others = torch.empty(n), recycled(n, outputs - 1)
         kept: tuple[Tensor, ...] = ()

@@ -61,7 +61,7 @@ _ACTIVATIONS = {
 class _PointNetwork(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, structure: tuple[tuple[int, int], ...], inputs: Tensor, *parameters: Tensor) -> Tensor:
-        points, *own = [tensor.detach().contiguous() for tensor in (inputs, *parameters)]
+        points, *own = [tensor.contiguous() for tensor in (inputs, *parameters)]
         outputs, kept = recycled(len(points), len(own[-1])), None
         if any(ctx.needs_input_grad):
             kept = recycled(len(points), sum(-(-len(bias) // _LANES) * _LANES for bias in own[1:-1:2]))

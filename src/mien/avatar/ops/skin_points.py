@@ -60,7 +60,7 @@ def unskin(points: Float[Tensor, "n 3"], transforms: Float[Tensor, "n 3 4"]) -> 
 class _SkinPoints(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Tensor) -> Tensor:
-        given = [tensor.detach().contiguous() for tensor in arguments]
+        given = [tensor.contiguous() for tensor in arguments]
         posed = torch.empty_like(given[1])
         _native.skin_points(_native.SkinPoints(*unpacked(*given)), *unpacked(posed))
         ctx.save_for_backward(*given)

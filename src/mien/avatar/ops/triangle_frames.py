@@ -157,7 +157,7 @@ _topologies = WeakIdKeyDictionary()
 class _BindToWorld(torch.autograd.Function):
     @staticmethod
     def forward(ctx, vertices: Tensor, faces: Tensor, *gaussians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = tuple(tensor.detach().contiguous() for tensor in (vertices, faces, *gaussians))
+        inputs = tuple(tensor.contiguous() for tensor in (vertices, faces, *gaussians))
         batch, count = len(vertices), len(gaussians[0])
         frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
         means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
@@ -178,7 +178,7 @@ class _BindToWorld(torch.autograd.Function):
         vertex_gradient = torch.empty_like(vertices) if ctx.needs_input_grad[0] else None
         world = [gradient.contiguous() for gradient in world_gradients]
         topology = rig_topology(vertices.shape[1], ctx.faces, ctx.face_index)
-        inputs = (tensor.detach() for tensor in (vertices, *local, frames, scales, *world))
+        inputs = (vertices, *local, frames, scales, *world)
         known = unpacked(*inputs, *local_gradients, vertex_gradient)
         _native.rig_backward(
             topology,

@@ -50,7 +50,7 @@ class _TrianglePenalties(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: _Pair, weights: _Pair):
-        inputs = unpacked(*(tensor.detach().contiguous() for tensor in (means, log_scales, radii)))
+        inputs = unpacked(*(tensor.contiguous() for tensor in (means, log_scales, radii)))
         gradients, values = (torch.empty_like(means), torch.empty_like(log_scales)), (torch.empty(()), torch.empty(()))
         _native.triangle_penalties(thresholds, weights, *inputs, *unpacked(*gradients, *values))
         ctx.save_for_backward(*gradients)
