@@ -244,6 +244,18 @@ def test_a_run_as_published_says_that_its_frames_were_aligned(workspace, capsys,
     assert len(told) == tells
 
 
+def test_a_paper_s_epochs_are_passes_over_the_data_or_a_message_says_how(workspace, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("mien.pipeline.train.train", lambda *given, **more: None)
+    summary = {"gaussians": 400, "steps": 1, "seconds": 0.0}
+    monkeypatch.setattr("mien.pipeline.train.read_training_summary", lambda run_dir: summary)
+    told = []
+    line = ["train", str(workspace), "--run", "other", "--method", "mono_gaussian_avatar"]
+    for preset, steps in (("paper", "479"), ("paper", "480"), ("draft", "479")):
+        assert main([*line, "--preset", preset, "--steps", steps]) == 0
+        told.append("over the 4 training frames, as in the paper; --steps 480 makes" in capsys.readouterr().err)
+    assert told == [True, False, False]
+
+
 def test_wrong_options_are_one_line(workspace: Path, capsys) -> None:
     for option, told in (
         (("--alignment.iterations", "0"), "--alignment.iterations 0: give a number from 1 to 100000"),

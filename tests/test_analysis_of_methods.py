@@ -343,6 +343,9 @@ def test_the_frontal_quarter_has_the_views_nearest_to_the_median():
     yaws = np.array([-0.9, 0.05, 0.8, 0.0, -0.05, 0.7, -0.8, 0.02])
     whole = measured(np.stack([yaws, 0 * yaws], 1), np.zeros((8, 1)))
     assert mono_gaussian_avatar.frontal_quarter(whole) == [3, 7]
+    # Clips are successive timesteps: the two that are nearest to the front, and the four with the most varied views.
+    assert mono_gaussian_avatar.clip(whole, 0.25, mixed=False) == [3, 4]
+    assert mono_gaussian_avatar.clip(whole, 0.5, mixed=True) == [0, 1, 2, 3]
     # Clips are successive timesteps, whatever lies between the best ones.
     assert mono_gaussian_avatar.clip(whole, 0.25, mixed=False) == [3, 4]
     assert mono_gaussian_avatar.clip(whole, 0.5, mixed=True) == [0, 1, 2, 3]

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import sys
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from mien.cli import COMMANDS, main
 from mien.commands.parsing import parse
 from mien.errors import UserError
 from mien.formats.page import write_page
+from mien.lab.analysis import gaussian_avatars, headgas
 from toy_package import blocks
 from web_case import browse, drawn_head, served, violations
 
@@ -41,6 +43,44 @@ def test_files_and_commands_that_pages_name_exist() -> None:
         for names in re.findall(r"`mien ((?:[a-z][a-z-]*(?: \| )?)+)", text):
             missing += [(page.name, name) for name in names.split(" | ") if name.split()[0] not in COMMANDS]
     assert missing == []
+
+
+def test_tests_that_pages_name_exist() -> None:
+    named = {
+        (page.name, *each) for page, text in PROSE.items() for each in re.findall(r"`(test_\w+)::(test_\w+)", text)
+    }
+    assert len(named) > 250
+    sources = {file: (ROOT / f"tests/{file}.py").read_text(encoding="utf-8") for _, file, _ in named}
+    assert sorted(each for each in named if f"def {each[2]}(" not in sources[each[1]]) == []
+
+
+CLAIMS = {
+    int(number): cells.split(" | ")
+    for number, cells in re.findall(r"^\| (\d+) \| (.*) \|$", PROSE[ROOT / "docs" / "papers.md"], re.MULTILINE)
+}
+"""Number of a claim of the papers -> place, claim, what mien has, what shows it, and its state."""
+
+
+def test_every_claim_of_the_papers_has_a_state_and_what_is_full_names_what_shows_it() -> None:
+    assert [*CLAIMS] == [*range(1, 94)]
+    counts = Counter(re.split("[:;]", state)[0] for *_, state in CLAIMS.values())
+    (told,) = re.findall(r"^\| all \| ([\d |]+) \|$", PROSE[ROOT / "docs" / "papers.md"], re.MULTILINE)
+    assert told.split(" | ") == [str(n) for n in (93, *map(counts.pop, ("fully", "partly", "not", "cannot here")))]
+    assert counts == {}
+    shown = {number: shown for number, (*_, shown, state) in CLAIMS.items() if state.startswith("fully")}
+    assert [each for each in shown.items() if not re.match(r"`test_\w+::test_|`mien |the same", each[1])] == []
+
+
+def test_the_papers_figures_are_those_that_analyses_show() -> None:
+    def numbers(claim: int) -> list[float]:
+        return [float(each.replace(",", "")) for each in re.findall(r"\d[\d.]*(?:,\d{3})*", CLAIMS[claim][1])]
+
+    sizes = [size[::-1] for size in (min(gaussian_avatars.TABLE_3), max(gaussian_avatars.TABLE_3))]
+    assert numbers(28) == [*gaussian_avatars.TABLE_3.values(), *sizes[0], *sizes[1]]
+    assert numbers(52) == [*headgas.SIZES.values(), *headgas.SIZES]
+    full, *others = (headgas.ABLATIONS[name][1:] for name in ("full", *(set(headgas.ABLATIONS) - {"full"})))
+    known = [[value for value in column if value is not None] for column in zip(*others, strict=True)]
+    assert numbers(54) == [*full, *(most(column) for column in known for most in (min, max))]
 
 
 def test_pictures_are_small_and_described() -> None:

@@ -51,7 +51,8 @@ def test_the_tally_gives_the_paper_s_percentages() -> None:
     assert percents == {
         "nerface": [12.67, 23.33], "imavatar": [0.0, 0.0], "pointavatar": [8.67, 8.0], "ours": [78.67, 68.67]
     }  # fmt: skip
-    assert content["judgements"] == 150
+    assert (content["judgements"], files.StudySettings().clips) == (150, 10)
+    assert list(files.QUESTIONS.values()) == ["visual quality", "expression accuracy"]
     for entry in content["runs"].values():
         for figures in entry.values():
             assert 0 <= figures["low"] <= figures["percent"] <= figures["high"] <= 100

@@ -265,6 +265,11 @@ class MethodConfig:
         check_ranges(self, lambda name: f"--method.{name.replace('_', '-')}")
 
 
+def steps_of_passes(config: MethodConfig, frames: int) -> int | None:
+    """The steps of a run in which each epoch of the method is a pass over some training frames; None without epochs."""
+    return vars(config)["epochs"] * frames if "epochs" in vars(config) else None
+
+
 @dataclass(frozen=True)
 class FreePointsConfig(MethodConfig):
     """Settings of free points that networks move, which several methods share."""

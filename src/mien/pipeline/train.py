@@ -3,7 +3,7 @@
 from contextlib import ExitStack
 from dataclasses import replace
 
-from mien.avatar.settings import MethodConfig
+from mien.avatar.settings import MethodConfig, steps_of_passes
 from mien.capture.store import read_capture
 from mien.disk.locks import read_beside_writers
 from mien.disk.workspace import Workspace
@@ -11,6 +11,7 @@ from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.machine.progress import say
 from mien.pipeline.view_training import TrainingView
+from mien.training.footage.frames import training_frames
 from mien.training.footage.sequence import Sequence, read_sequence
 from mien.training.run import check_untouched, is_finished, read_training_summary
 from mien.training.settings import TrainSettings
@@ -72,6 +73,12 @@ def run_training_stage(
         say(
             f"{', '.join(aligned)}: frames were aligned to a quick avatar, which no paper does; for a run without that,"
             f" track them again first: `mien track {workspace.root} --again`"
+        )
+    frames = len(training_frames(loaded, settings))
+    if published and (steps_of_passes(method, frames) or settings.steps) != settings.steps:
+        say(
+            f"{run}: its epochs are not passes over the {frames} training frames, as in the paper; "
+            f"--steps {steps_of_passes(method, frames)} makes them so"
         )
     with ExitStack() as closing:
         if not is_finished(run_dir):
