@@ -1,6 +1,7 @@
 """Crops, mattes and jitter, what comes with a video, and reports of blur, darkness, over-exposure and casts."""
 
 import itertools
+from dataclasses import replace
 from importlib.util import find_spec
 
 import cv2
@@ -10,8 +11,9 @@ import pytest
 from capture_helpers import face_picture, light_of
 from mien.capture.from_video import capture_video_parts, open_job
 from mien.capture.person import backend
+from mien.capture.person.backend import detector_of
 from mien.capture.person.crop import choose_crop, whole_picture
-from mien.capture.person.faces import FaceFinder, LandmarkDetector, MeshReader
+from mien.capture.person.faces import IBUG68, FaceFinder, LandmarkDetector, MeshReader
 from mien.capture.person.given import read_landmarks
 from mien.capture.person.litert import Mesh
 from mien.capture.person.matte import Segmenter, refine_matte
@@ -20,11 +22,13 @@ from mien.capture.quality import measure_face, quality_report, relative_quality
 from mien.capture.settings import CaptureSettings
 from mien.disk.files import write_arrays
 from mien.errors import UserError
+from mien.face import load_face_model
 from mien.lab.synthetic.recipe import SyntheticRecipe
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.media.colors import srgb_signal
 from mien.media.picture_files import write_png
 from mien.media.video import read_lazily, read_video_frames, write_video
+from mien.tracking.landmarks.detector_response import read_response
 from refusals import refuses
 
 
@@ -110,6 +114,28 @@ def test_given_landmarks_and_mattes_are_taken_as_they_are(test_data, tmp_path):
     with pytest.raises(UserError, match="plate.png: is 160x100, but the video's pictures are 160x160"):
         capture_video_parts(clip, tmp_path / "other", CaptureSettings(clean_plate=tmp_path / "plate.png"))
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.unchecked
+def test_the_68_points_of_another_detector_take_the_places_of_detected_ones(test_data, tmp_path):
+    """All but the contour's, and nothing is known of that detector's habits."""
+    clip, settings = tmp_path / "clip.mp4", CaptureSettings(crop="none")
+    write_video(clip, iter([face_picture(test_data)] * 4), 25.0)
+    (detected,) = capture_video_parts(clip, tmp_path / "detected", settings)
+    points = detected.landmarks[:, 0, list(IBUG68)] + 2.0
+    rows = [",".join(f"{value:.4f}" for value in row.flat) for row in points]
+    (tmp_path / "star.csv").write_text("\n".join([rows[0], "", *rows[2:]]))
+    (capture,) = capture_video_parts(clip, tmp_path / "given", replace(settings, landmarks=tmp_path / "star.csv"))
+    moved = np.zeros(478)
+    moved[list(IBUG68[17:])] = 2.0
+    assert capture.valid[:, 0].tolist() == [True, False, True, True]
+    found = (capture.landmarks - detected.landmarks)[[0, 2, 3], 0]
+    np.testing.assert_allclose(found, np.broadcast_to(moved[:, None], found.shape), atol=1e-3)
+    model = load_face_model("anny")
+    means = [read_response(model, 0.003, detector_of(one.source)).mean.abs().max() for one in (detected, capture)]
+    assert means[0] > 1e-3 > means[1] == 0
+    (tmp_path / "star.csv").write_text(f"{rows[0]}\n1,2\n")
+    refuses("line 2 has 2 numbers, expected 136", read_landmarks, tmp_path / "star.csv", 4)
 
 
 def test_mattes_may_be_a_video(test_data, tmp_path):

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from known import known
 from mien.camera import camera_from_fov
+from mien.capture.person.faces import IBUG68
 from mien.face import FaceModel, FaceParams, load_face_model, loading
 from mien.face.head_parts import part_boxes
 from mien.face.posing import head_poses
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.tracking.landmarks import embedding
 from mien.tracking.landmarks.embedding import DetectedViews, EmbeddingSettings, best_point, embed_landmarks
-from mien.tracking.landmarks.groups import IBUG68, LEFT_EYELIDS, RIGHT_EYELIDS
+from mien.tracking.landmarks.groups import LEFT_EYELIDS, RIGHT_EYELIDS
 from small_face_model import make_small_face_model
 
 

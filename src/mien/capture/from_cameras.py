@@ -257,7 +257,7 @@ def _finish(
             view.camera_id: {"file": view.job.frames.path.name, **origin_of(part)}
             for view, part in zip(views, parts, strict=True)
         },
-        **detector_entry("mediapipe" if whole.settings.landmarks else whole.detector),
+        **detector_entry(views[0].job.given().found_by(whole.detector)),
     }
     finish(
         layout, out, chunks, report, name=whole.name, fps=frame_rate(timestamps, whole.frames.fps),

@@ -373,7 +373,7 @@ def _finish(job: CaptureJob, draft: Draft, place: tuple[int, int], given: GivenI
         "content_hash": job.frames.content_hash,
         **origin_of(part),
         "part": {"of": job.name, "number": place[0], "count": place[1]},
-        **detector_entry(job.detector if given.landmarks is None else "mediapipe"),
+        **detector_entry(given.found_by(job.detector)),
     }
     finish(
         draft.layout, out, [draft.chunks], report, name=part.name, fps=frame_rate(timestamps, job.frames.fps),

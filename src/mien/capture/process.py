@@ -164,6 +164,7 @@ class PartProcessor:
                     found = follower.find(timestep, image)
                 elif self._given.landmarks is not None and part.person.seen[timestep]:
                     found = part.crop.to_output(self._given.landmarks[number])
+                found = self._given.with_points(found, part.crop, number)
                 if found is not None:
                     landmarks[index] = found
                 make_matte = prepare(number, image)

@@ -14,6 +14,8 @@ from typing import Any, Literal, TypeVar
 DetectorChoice = Literal["auto", "mediapipe", "litert"]
 """The choices of a user. auto is mediapipe where it is installed, and otherwise litert."""
 Detector = Literal["mediapipe", "litert"]
+FoundBy = Literal["mediapipe", "litert", "other"]
+"""What found the landmarks of a capture. other: another program found the 68 points of 300-W."""
 MODULE_OF: dict[Detector, str] = {"mediapipe": "mediapipe", "litert": "ai_edge_litert"}
 _NOISE = re.compile(
     rb"^(INFO: Created TensorFlow Lite|WARNING: All log messages before absl|[IW]\d{4} \d\d:\d\d:\d\d|[IW]0000 )"
@@ -29,14 +31,15 @@ def choose_detector(choice: DetectorChoice = "auto") -> Detector:
     return choice
 
 
-def detector_entry(detector: Detector) -> dict[str, str]:
+def detector_entry(detector: FoundBy) -> dict[str, str]:
     """Return what a capture's `source` says about its detector. Captures by mediapipe say nothing."""
     return {} if detector == "mediapipe" else {"detector": detector}
 
 
-def detector_of(source: Mapping[str, Any]) -> Detector:
+def detector_of(source: Mapping[str, Any]) -> FoundBy:
     """Return the detector that found the landmarks of a capture with this `source`."""
-    return "litert" if source.get("detector") == "litert" else "mediapipe"
+    found = source.get("detector")
+    return found if found in ("litert", "other") else "mediapipe"
 
 
 _Opened = TypeVar("_Opened", bound="Networks")

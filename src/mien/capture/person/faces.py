@@ -18,6 +18,15 @@ _FACE_CONFIDENCE = 0.5  # least score of a found face. MediaPipe's default
 
 LANDMARKS = 478
 """Points of MediaPipe's face mesh with irises: 468 of the mesh and 5 of each iris."""
+IBUG68 = (
+    127, 234, 93, 58, 172, 136, 149, 148, 152, 377, 378, 365, 397, 288, 323, 454, 356,  # contour, right to left ear
+    70, 63, 105, 66, 107, 336, 296, 334, 293, 300,  # brows
+    168, 197, 5, 4, 98, 97, 2, 326, 327,  # nose
+    33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380,  # eyes
+    61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181,  # outer lips
+    78, 82, 13, 312, 308, 317, 14, 87,  # inner lips
+)  # fmt: skip
+"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are a silhouette there, but fixed points here."""
 MAX_FACES = 4
 """Most faces of a frame that are kept, the largest first."""
 

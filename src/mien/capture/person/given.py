@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from mien.capture.person.backend import Detector, FoundBy
 from mien.capture.person.crop import Crop, whole_picture
-from mien.capture.person.faces import LANDMARKS
+from mien.capture.person.faces import IBUG68, LANDMARKS
 from mien.disk.files import read_arrays
 from mien.disk.limits import MAX_NUMBER
 from mien.disk.reading import open_ordinary
@@ -68,6 +69,25 @@ class GivenInputs:
     mattes: GivenMattes | None = None
     landmarks: Float[np.ndarray, "n l 2"] | None = None
     """Positions in pixels of the source's pictures (straightened, if a lens is known), a row for each frame."""
+    points: Float[np.ndarray, "n 68 2"] | None = None
+    """The same of the 68 points of 300-W, which take the places of detected landmarks."""
+
+    def found_by(self, detector: Detector) -> FoundBy:
+        """Return what finds the landmarks, if `detector` runs where none are given."""
+        return "other" if self.points is not None else detector if self.landmarks is None else "mediapipe"
+
+    def with_points(
+        self, found: Float[np.ndarray, "l 2"] | None, crop: Crop, number: int
+    ) -> Float[np.ndarray, "l 2"] | None:
+        """Return landmarks in a crop with the points of the source's frame `number`; None where there are none.
+
+        The contour stays as it was found, because that of 300-W is a silhouette.
+        """
+        if found is None or self.points is None:
+            return found
+        merged = np.array(found)
+        merged[list(IBUG68[17:])] = crop.to_output(self.points[number])[17:]
+        return merged if np.isfinite(merged).all() else None
 
 
 def read_given(frames: FrameSource, plate: Path | None, mattes: Path | None, landmarks: Path | None) -> GivenInputs:
@@ -102,7 +122,8 @@ def read_given(frames: FrameSource, plate: Path | None, mattes: Path | None, lan
     if landmarks is not None:
         points = read_landmarks(landmarks, frames.count())
         points = points if frames.lens is None else frames.lens.straighten_points(points, width, height)
-        given = replace(given, landmarks=points)
+        whole = points.shape[1] == LANDMARKS
+        given = replace(given, landmarks=points) if whole else replace(given, points=points)
     return given
 
 
@@ -127,7 +148,8 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
 
     Args:
         path: a .safetensors file with `landmarks` [n, 478, 2], or a .csv file with n lines of x0, y0, x1, y1, ... (956
-            numbers; empty or nan means no face; a first line of column names is skipped).
+            numbers; empty or nan means no face; a first line of column names is skipped). With 68 in place of 478, they
+            are the points of 300-W.
         source_frames: the number of frames in the source, n.
     """
     if path.suffix == ".safetensors":
@@ -139,11 +161,10 @@ def read_landmarks(path: Path, source_frames: int) -> Float[np.ndarray, "n l 2"]
         landmarks = _read_csv(path, source_frames)
     else:
         raise UserError(f"--capture.landmarks {path}: cannot be read; give a .csv or .safetensors file")
-    expected = (source_frames, LANDMARKS, 2)
-    if landmarks.shape != expected:
+    if landmarks.shape not in [(source_frames, count, 2) for count in (LANDMARKS, len(IBUG68))]:
         raise UserError(
-            f"{path}: has landmarks of shape {list(landmarks.shape)}, expected {list(expected)}: "
-            "a row for each frame of the source"
+            f"{path}: has landmarks of shape {list(landmarks.shape)}, expected {[source_frames, LANDMARKS, 2]}: "
+            "a row for each frame of the source (or 68 points of 300-W in each)"
         )
     if landmarks.dtype.kind not in "iuf":
         raise UserError(f"{path}: `landmarks` is {landmarks.dtype}; write numbers, pixels, as float32")
@@ -170,19 +191,22 @@ def _check_size(path: Path, frames: int) -> None:
 def _read_csv(path: Path, most: int) -> np.ndarray:
     """Read the rows, at most one beyond `most`, which is enough to see that there are too many."""
     rows: list[np.ndarray] = []
+    count = 2 * LANDMARKS
     try:
         for index, (number, line) in enumerate(split_lines(open_ordinary(path), _MAX_LINE)):
             words = (cell.strip().lower() for cell in line)
             if index == 0 and any(word[:1].isalpha() and word != "nan" for word in words):
                 continue
-            if len(line) not in (0, 2 * LANDMARKS):
-                raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {2 * LANDMARKS}")
-            rows.append(np.array([_number(path, number, cell) for cell in line] or [np.nan] * (2 * LANDMARKS)))
+            if len(line) == 2 * len(IBUG68) and all(np.isnan(row).all() for row in rows):
+                count, rows = len(line), [row[: len(line)] for row in rows]
+            if len(line) not in (0, count):
+                raise UserError(f"{path}: line {number} has {len(line)} numbers, expected {count}")
+            rows.append(np.array([_number(path, number, cell) for cell in line] or [np.nan] * count))
             if len(rows) > most:
                 break
     except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path}: cannot be read as csv ({error}); write it again") from None
-    return np.array(rows).reshape(len(rows), LANDMARKS, 2)
+    return np.array(rows).reshape(len(rows), count // 2, 2)
 
 
 def _number(path: Path, line: int, cell: str) -> float:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mien.capture.person.backend import Detector
+from mien.capture.person.backend import Detector, FoundBy
 from mien.face.model import FaceModel
 
 LARGEST_TURN = 0.6
@@ -73,13 +73,13 @@ def unknown_response(landmarks: int, expressions: int, sigma: float = OFFSET_SIG
     )
 
 
-def response_path(face_model_name: str, detector: Detector = "mediapipe") -> Path:
+def response_path(face_model_name: str, detector: FoundBy = "mediapipe") -> Path:
     """Path of the response file that ships with mien for a face model and a detector. The file may not exist."""
     ending = "detector" if detector == "mediapipe" else detector
     return Path(str(resources.files("mien.tracking") / "data" / f"{face_model_name}_{ending}.npz"))
 
 
-def read_response(face_model: FaceModel, sigma: float, detector: Detector = "mediapipe") -> DetectorResponse:
+def read_response(face_model: FaceModel, sigma: float, detector: FoundBy = "mediapipe") -> DetectorResponse:
     """Read the response measured for a face model and detector. Without one for the mesh, only `sigma` is known."""
     path, of_mediapipe = response_path(face_model.name, detector), response_path(face_model.name)
     landmarks, expressions = len(face_model.landmarks["mediapipe"].faces), len(face_model.expression_names)

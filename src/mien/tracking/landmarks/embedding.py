@@ -15,14 +15,14 @@ from torch import Tensor
 
 from mien.camera import Camera, camera_from_fov
 from mien.capture.person.backend import load_solution, quiet_mediapipe
-from mien.capture.person.faces import LANDMARKS
+from mien.capture.person.faces import IBUG68, LANDMARKS
 from mien.errors import UserError
 from mien.face.model import FaceModel, Landmarks
 from mien.face.params import FaceParams
 from mien.machine.progress import track_progress
 from mien.render.mesh import Headlight, rasterize_mesh, render_mesh
 from mien.rotation import rigid_transform
-from mien.tracking.landmarks.groups import IBUG68, LEFT_IRIS, RIGHT_IRIS
+from mien.tracking.landmarks.groups import LEFT_IRIS, RIGHT_IRIS
 
 _SCALP_FRONT = 0.06  # landmarks may lie on the scalp only farther ahead of the head frame's origin than this, in metres
 _LEAST_SEEN = 0.25

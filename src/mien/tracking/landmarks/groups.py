@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mien.capture.person.faces import LANDMARKS
+from mien.capture.person.faces import IBUG68, LANDMARKS
 from mien.tracking.settings import LandmarkSet
 
 OVAL = (
@@ -26,16 +26,6 @@ EYE_CORNERS = (33, 133, 263, 362)
 RIGHT_IRIS = (468, 469, 470, 471, 472)
 """The centre, then the rim, of the subject's right iris."""
 LEFT_IRIS = (473, 474, 475, 476, 477)
-
-IBUG68 = (
-    127, 234, 93, 58, 172, 136, 149, 148, 152, 377, 378, 365, 397, 288, 323, 454, 356,  # contour, right to left ear
-    70, 63, 105, 66, 107, 336, 296, 334, 293, 300,  # brows
-    168, 197, 5, 4, 98, 97, 2, 326, 327,  # nose
-    33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380,  # eyes
-    61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181,  # outer lips
-    78, 82, 13, 312, 308, 317, 14, 87,  # inner lips
-)  # fmt: skip
-"""MediaPipe's landmark for each of 300-W's 68 points. The first 17 are a silhouette there, but fixed points here."""
 
 
 def landmark_weights(landmarks: LandmarkSet = "mediapipe") -> Float[Tensor, " l"]:
