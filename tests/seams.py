@@ -32,7 +32,7 @@ MAY_NAME = {
     "src/mien/formats/gaussian_avatars.py": "the files of that method's own program become its avatars",
 }
 """Files that may name a method although they are not its own, and why."""
-OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}.py")
+OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}.py", "src/mien/lab/analysis/{}_")
 """Files of a method itself."""
 
 

@@ -11,16 +11,11 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-import torch
 import zstandard
 from PIL import Image
 
+from mien.formats.shared.splats import gaussians_of
 from mien.gaussians import Gaussians
-
-
-def _gaussians(*arrays: np.ndarray) -> Gaussians:
-    """Gaussians of means, quaternions wxyz, scales, opacities and SH coefficients."""
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
 
 
 def _with_largest(small: np.ndarray, largest: np.ndarray) -> np.ndarray:
@@ -57,7 +52,8 @@ def read_spz(path: Path) -> Gaussians:
     small = (fields & 511) / 511 / np.sqrt(2) * np.where(fields & 512, -1, 1)
     sh = np.concatenate([(first / 255.0 - 0.5) / 0.15, higher / 128.0 - 1], axis=1).reshape(count, (degree + 1) ** 2, 3)
     quats = _with_largest(small, words[:, 0] >> 30)[:, [3, 0, 1, 2]]
-    return _gaussians(fixed.reshape(-1, 3) / 2.0**fraction, quats, np.exp(scales / 16.0 - 10), alpha[:, 0] / 255.0, sh)
+    means, sizes = fixed.reshape(-1, 3) / 2.0**fraction, np.exp(scales / 16.0 - 10)
+    return gaussians_of((means, quats, sizes, alpha[:, 0] / 255.0, sh))
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -85,7 +81,7 @@ def read_sog(path: Path) -> Gaussians:
             sh = np.concatenate([sh, looked_up("shN", palette[labels])], axis=1)
     quats = _with_largest((turns[:, :3] / 255 - 0.5) * np.sqrt(2), turns[:, 3] - 252)
     means, sizes = np.sign(logged) * np.expm1(np.abs(logged)), np.exp(looked_up("scales", scales[:, :3]))
-    return _gaussians(means, quats, sizes, shades[:, 3] / 255, sh)
+    return gaussians_of((means, quats, sizes, shades[:, 3] / 255, sh))
 
 
 def read_usd(path: Path, time: float | None = None) -> Gaussians:
@@ -100,4 +96,4 @@ def read_usd(path: Path, time: float | None = None) -> Gaussians:
     at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
     means, turns, scales, opacities, sh = (np.array(attribute.Get(at)) for attribute in attributes)
     sh = sh.reshape(len(means), len(sh) // len(means), 3)
-    return _gaussians(means, turns[:, [3, 0, 1, 2]], scales, opacities, sh)
+    return gaussians_of((means, turns[:, [3, 0, 1, 2]], scales, opacities, sh))

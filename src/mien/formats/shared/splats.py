@@ -1,5 +1,6 @@
 """Parts that files of Gaussians in a pose share: checked arrays and unit rotations."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,15 @@ def finite_arrays(path: Path, gaussians: "mien.gaussians.Gaussians") -> tuple[np
     if bad.any():
         raise UserError(f"{path}: {bad.sum()} of {len(bad)} Gaussians are NaN or infinite; train it again")
     return arrays
+
+
+def gaussians_of(arrays: Iterable[np.ndarray]) -> "mien.gaussians.Gaussians":
+    """Gaussians of means, quaternions, scales, opacities and SH."""
+    import torch
+
+    from mien.gaussians import Gaussians
+
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
