@@ -25,16 +25,14 @@ MAY_NAME = {
     "src/mien/avatar/methods.py": "the list of methods",
     "src/mien/avatar/point_avatar/avatar.py": "uses the deformation network that its successor took over",
     "src/mien/lab/analysis/registry.py": "the list of analyses, one for the paper of each method",
-    "src/mien/lab/benchmarking/__init__.py": "the list of benchmarks of training steps",
     "src/mien/lab/benchmarking/train_step.py": "measures the step of one method",
-    "src/mien/lab/benchmarking/method_steps.py": "measures the steps of two methods",
     "src/mien/formats/registry.py": "the list of formats; one is named after the program whose files it reads",
     "src/mien/datasets/registry.py": "the list of datasets; one is named after the program whose files it reads",
     "src/mien/datasets/gaussian_avatars.py": "reads the files of that method's own program",
     "src/mien/formats/gaussian_avatars.py": "the files of that method's own program become its avatars",
 }
 """Files that may name a method although they are not its own, and why."""
-OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}.py")
+OWN = ("src/mien/avatar/{}/", "src/mien/avatar/{}.py", "src/mien/lab/analysis/{}.py", "src/mien/lab/analysis/{}_")
 """Files of a method itself."""
 
 

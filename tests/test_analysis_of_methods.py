@@ -19,8 +19,9 @@ from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.settings import GradientSettings, PerceptualLoss, Photometric
 from mien.cli import main
 from mien.gaussians import Gaussians
-from mien.lab.analysis import headgas, measuring, mono_gaussian_avatar
-from mien.lab.analysis.headgas import Trained, busy_face, start_of_bases, trained_range, with_expression
+from mien.lab.analysis import headgas, headgas_ablations, measuring, mono_gaussian_avatar
+from mien.lab.analysis.headgas import Trained, start_of_bases, trained_range, with_expression
+from mien.lab.analysis.headgas_ablations import busy_face
 from mien.lab.analysis.joining import joined_rows
 from mien.lab.analysis.measuring import head_camera, mouth_camera
 from mien.lab.analysis.registry import AnalysisOptions
@@ -50,7 +51,8 @@ def toy(made_once: MadeOnce) -> Path:
 
 @pytest.fixture(autouse=True)
 def _small_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("SIZES", {16: 4.0, 32: 8.0}), ("TIMED_SIDE", 16), ("SIDE", 32)):
+    monkeypatch.setattr(headgas_ablations, "TIMED_SIDE", 16)
+    for name, value in (("SIZES", {16: 4.0, 32: 8.0}), ("SIDE", 32)):
         monkeypatch.setattr(headgas, name, value)
 
 
@@ -135,18 +137,18 @@ def test_ablations_and_sizes_on_a_device(workspace: Path, elsewhere: set[str]) -
 
 
 def test_rows_differ_only_in_what_they_say() -> None:
-    plain = headgas.ablation_configs(CONFIG)
+    plain = headgas_ablations.ablation_configs(CONFIG)
     assert "no_perceptual" not in plain
     free = replace(CONFIG, density=replace(_GROWTH, rules_off=("cap",)))
     assert (plain["full"], plain["delta"]) == (free, replace(free, variant="delta")), "without a limit of Gaussians"
     config = replace(CONFIG, variant="no_mlp", photometric=Photometric(perceptual=PerceptualLoss(weight=0.1)))
-    rows = headgas.ablation_configs(config)
-    assert list(rows) == list(headgas.ABLATIONS)
+    rows = headgas_ablations.ablation_configs(config)
+    assert list(rows) == list(headgas_ablations.ABLATIONS)
     without = rows["no_perceptual"]
     assert (without.variant, without.photometric.perceptual.weight) == ("full", 0.0)
     assert rows["full"] == replace(config, variant="full", density=free.density)
     rows = [{"name": name, "gaussians": n, "head_psnr": None} for name, n in (("delta", 40), ("full", 50))]
-    (few,) = headgas.ablation_findings(10, rows)
+    (few,) = headgas_ablations.ablation_findings(10, rows)
     assert "with delta(mu, R) has the fewest Gaussians (40)" in few
 
 
@@ -155,9 +157,9 @@ def test_the_network_without_blending_widens_to_a_plateau(monkeypatch: pytest.Mo
     monkeypatch.setattr(measuring, "held_out_scores", lambda width, metric: {"head_psnr": scores[width]})
     context: Any = SimpleNamespace(train=lambda name, config: config.hidden)
     first: Any = 8
-    assert headgas.widened(context, CONFIG, first) == (16, {8: 20.0, 16: 20.5, 32: 20.55})
+    assert headgas_ablations.widened(context, CONFIG, first) == (16, {8: 20.0, 16: 20.5, 32: 20.55})
     scores[8] = None
-    assert headgas.widened(context, CONFIG, first) == (8, {}), "nothing was held out"
+    assert headgas_ablations.widened(context, CONFIG, first) == (8, {}), "nothing was held out"
 
 
 def test_gaussians_are_removed_from_near_to_far() -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from capture_helpers import face_picture, light_of
-from mien.capture.from_video import capture_video_parts, open_job
+from mien.capture.from_video import capture_video_parts
+from mien.capture.job import open_job
 from mien.capture.person import backend
 from mien.capture.person.backend import detector_of
 from mien.capture.person.crop import choose_crop, whole_picture

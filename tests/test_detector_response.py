@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from detector_calibration import Sightings, fit_response
 
 from mien.camera import look_at
 from mien.face import load_face_model
-from mien.lab.synthetic.detector_calibration import Sightings, fit_response
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.parameters import layout_of

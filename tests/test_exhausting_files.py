@@ -1,11 +1,7 @@
 """Files that would take gigabytes or minutes, hold huge numbers, or were findings of the fuzzers: refused in one line.
 Each is refused before memory is taken, and the line names the file."""
 
-import io
-import json
 import shutil
-import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import train_toy
 from bounded_memory import MIB, allocating_at_most, refused
-from fuzzing.formats import members_of, zip_of
 from fuzzing.material import new_avatar, tiny_flame
 from fuzzing.repairs import joined, split
 from mien import runtime
@@ -38,8 +32,6 @@ from mien.face.models.flame import read_flame
 from mien.formats import ply, read_ply, write_ply
 from mien.formats.glb import EXTENSION, read_glb_avatar
 from mien.formats.ply import property_names
-from mien.formats.sog import read_sog, write_sog
-from mien.formats.usd import read_usd, write_usd
 from mien.gaussians import Gaussians
 from mien.media.picture_files import decode_png, png_fits
 from mien.media.source import FrameSelection, open_source
@@ -49,7 +41,6 @@ from recordings import row, write_csv, write_json
 from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
 from test_glb_avatar import rewritten, written
-from test_splat_files import needs_usd, some
 from toy_scene import toy_camera, toy_sequence
 
 DIGITS = int("9" * 400)
@@ -71,34 +62,6 @@ def test_arrays_of_a_glb_have_bounds(tmp_path: Path) -> None:
 
     path = rewritten(written("gaussian_avatars", tmp_path)[0], tmp_path / "a.glb", share)
     refused(read_glb_avatar, path, "its arrays are larger than its buffer")
-
-
-def test_members_of_a_sog_have_bounds(tmp_path: Path) -> None:
-    path = tmp_path / "a.sog"
-    write_sog(path, some(50, 4))
-    whole = path.read_bytes()
-    members = members_of(whole)
-    meta = json.loads(members["meta.json"])
-    large = io.BytesIO()
-    Image.new("RGB", (4096, 1024)).save(large, "WEBP", lossless=True)
-    changed = [
-        *((f"{name}.webp", large.getvalue(), "has more pixels than its 50 Gaussians need")
-          for name in ("means_l", "quats", "sh0", "shN_labels", "shN_centroids")),
-        *(("meta.json", json.dumps(meta | {part: meta[part] | {name: value}}).encode(), "cannot be read as .sog|infin")
-          for part, name, value in (
-            ("shN", "bands", 10**18), ("shN", "bands", -1), ("sh0", "codebook", [[0.0] * 300] * 256),
-            ("scales", "codebook", [1e4] * 256), ("sh0", "codebook", [0.0] * 99))),
-        ("meta.json", members["meta.json"] + b" " * (2 << 20), "too large"),
-    ]  # fmt: skip
-    for name, data, words in changed:
-        path.write_bytes(zip_of(members | {name: data}))
-        refused(read_sog, path, words)
-    path.write_bytes(zip_of(members, zipfile.ZIP_LZMA))
-    refused(read_sog, path, "is compressed in an unusual way")
-    directory = whole.index(b"PK\x01\x02")
-    for place, value in ((8, b"\x01\x00"), (10, b"\x63\x00"), (8, b"\x20\x00")):  # encrypted, method 99, patched
-        path.write_bytes(whole[: directory + place] + value + whole[directory + place + 2 :])
-        refused(read_sog, path, r"cannot be read as \.sog")
 
 
 def test_rows_of_a_ply_and_lists_of_json_have_a_bound(tmp_path: Path) -> None:
@@ -152,31 +115,6 @@ def test_a_tensor_of_thirty_thousand_axes_is_refused(made_once: MadeOnce, tmp_pa
     header["head_rotation"]["shape"] += [1] * 30_000
     track.write_bytes(joined(header, body))
     assert f"{track}: " in complaint(capsys, "evaluate", str(tmp_path / "W"))
-
-
-@needs_usd
-def test_a_stage_that_names_other_files_is_refused(tmp_path: Path) -> None:
-    """No other file is opened, and infinity is refused as in the other formats."""
-    write_usd(tmp_path / "good.usda", [some(4, 1)])
-    good = (tmp_path / "good.usda").read_text()
-    assert len(read_usd(tmp_path / "good.usda")) == 4
-    path = tmp_path / "a.usda"
-    for text in (
-        "(\n    subLayers = [@good.usda@]\n)\n",
-        'def "a" (\n    references = @good.usda@\n)\n{\n}\n',
-        'def "a" (\n    payload = @good.usda@\n)\n{\n}\n',
-        'def "a" (\n    variants = { string v = "x" }\n    prepend variantSets = "v"\n)\n{\n'
-        '    variantSet "v" = {\n        "x" (references = @good.usda@) {\n        }\n    }\n}\n',
-        'def "a" (\n    clips = { dictionary default = { asset[] assetPaths = [@good.usda@] } }\n)\n{\n}\n',
-    ):
-        path.write_text(f"#usda 1.0\n{text}")
-        refused(read_usd, path, "refers to other files, which are not opened; flatten it into one file")
-    start = good.index("point3f[] positions = [(") + len("point3f[] positions = [(")
-    for number in ("inf", "1e300"):
-        path.write_text(good[:start] + number + good[good.index(",", start) :])
-        refused(read_usd, path, "1 of 4 Gaussians are NaN or infinite")
-    path.write_text(good.replace("point3f[] positions", "string[] positions").replace("[(", '["', 1))
-    pytest.raises(UserError, read_usd, path)
 
 
 START = [row(f"0:00:00:0{frame}.0") for frame in range(6)]
@@ -255,24 +193,6 @@ def test_faces_of_another_type_or_size_and_those_that_face_nowhere_are_named(tmp
     turned: dict[str, Any] = {**arrays, "f": arrays["f"][:, ::-1]}
     np.savez(tmp_path / "tiny.npz", **turned)
     refuses(r"tiny\.npz: 'f' has no triangle that faces outwards", read_flame, tmp_path / "tiny.npz")
-
-
-def test_a_prim_of_usd_without_a_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """USD would end the process when it is asked for the files that such a layer refers to."""
-    Sdf = pytest.importorskip("pxr.Sdf", reason="usd-core is not installed")
-    layer = Sdf.Layer.CreateNew(str(tmp_path / "head.usda"))
-    layer.Save()
-
-    class Damaged:
-        def Traverse(self, start: object, visit: Callable[[object], None]) -> None:
-            visit(Sdf.Path.emptyPath)
-            visit(Sdf.Path.absoluteRootPath)
-
-        def GetCompositionAssetDependencies(self) -> None:
-            pytest.fail("USD would end the process here")
-
-    monkeypatch.setattr(Sdf.Layer, "FindOrOpen", lambda path: Damaged())
-    refuses("is damaged, or not a USD file", read_usd, tmp_path / "head.usda")
 
 
 # Matrices, which hold a rotation and a translation. `fuzzing.values` has those of cameras -----------------------------

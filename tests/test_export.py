@@ -1,6 +1,5 @@
 """.ply files, options of `mien export`, pictures and films: what is wrong is refused before any work."""
 
-import gzip
 import math
 import struct
 from dataclasses import replace
@@ -19,7 +18,6 @@ from mien.cli import main
 from mien.disk.files import write_json
 from mien.formats import in_world, read_ply, write_ply
 from mien.formats.ply import property_names
-from mien.formats.spz import read_spz
 from mien.gaussians import Gaussians, sh_from_rgb
 from mien.media.output import plan_output
 from mien.media.pixels import to_rgb, to_rgba
@@ -272,27 +270,3 @@ def test_other_plys_are_named(tmp_path: Path, types: dict[str, str], extra: str,
     written(path, types, "\n")
     path.write_bytes(path.read_bytes().replace(b"end_header", extra.encode() + b"end_header", 1))
     refuses(words, read_ply, path)
-
-
-def spz(path: Path, quats: list[tuple[int, int, int]], degree: int = 0) -> Path:
-    """Write a .spz of version 2, with three bytes for each of some quaternions, 1/4096 m apart along x."""
-    count = len(quats)
-    header = struct.pack("<IIIBBBB", 0x5053474E, 2, count, degree, 12, 0, 0)
-    places = b"".join(struct.pack("<i", at)[:3] + bytes(6) for at in range(count))
-    rest = bytes([255]) * count + bytes([128, 0, 255]) * count + bytes([160]) * 3 * count
-    higher = bytes([192]) * count * ((degree + 1) ** 2 - 1) * 3
-    path.write_bytes(gzip.compress(header + places + rest + b"".join(map(bytes, quats)) + higher))
-    return path
-
-
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_spz_of_version_2_is_read(tmp_path: Path, degree: int) -> None:
-    """Quaternions have x, y and z in steps of 1/127.5, and w is what is left."""
-    quats = [(128, 127, 128), (255, 128, 127), (0, 127, 128), (204, 128, 51)]
-    read = read_spz(spz(tmp_path / "a.spz", quats, degree))
-    torch.testing.assert_close(read.means[:, 0], torch.arange(4) / 4096, atol=1e-7, rtol=0)
-    expected = torch.tensor([[1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0.529, 0.6, 0, -0.6]])
-    torch.testing.assert_close(read.quats, expected, atol=0.005, rtol=0)
-    torch.testing.assert_close(read.scales, torch.ones(4, 3))
-    assert (read.opacities.tolist(), read.sh.shape) == ([1] * 4, (4, (degree + 1) ** 2, 3))
-    assert (read.sh[:, 1:] == 0.5).all()

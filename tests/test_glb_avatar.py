@@ -17,13 +17,13 @@ from mien.camera import Camera
 from mien.cli import main
 from mien.formats.glb import EXTENSION, MeshModel, read_glb_avatar, write_glb
 from mien.formats.shared.glb_file import GlbWriter, read_glb
-from mien.formats.spz import read_spz
 from mien.formats.vrm import BODY, LICENCE, write_vrm
 from mien.render import rasterize
 from mien.runtime.named import visemes
 from needs import NO_THREE_VRM, NO_VALIDATOR
 from refusals import complaint, refuses
 from shared_things import MadeOnce, toy_workspace
+from splat_readers import read_spz
 from test_glb import expect_valid, mesh_model
 from test_runtime import new_avatar
 from toy_scene import toy_camera

@@ -57,14 +57,6 @@ def any_fault(place: Place, dice: Random, elsewhere: float = 0.35) -> str:
     return chosen(place, dice)
 
 
-def faulty_new_name(place: Place, dice: Random) -> str:
-    """Make a fault, and give the file a name of its own: USD keeps stages by their names."""
-    kind = faulty_file(place, dice)
-    if place.file.is_file() and not place.file.is_symlink():
-        place.file = place.file.rename(place.file.with_stem(f"{dice.getrandbits(60):x}"))
-    return kind
-
-
 def faulty_format(place: Place, dice: Random) -> str:
     kind, data = FORMATS.get(place.file.suffix, faulty_bytes)(place.file.read_bytes(), dice)
     place.write(data)

@@ -18,7 +18,7 @@ import safetensors.numpy
 
 from damage import flip_or_cut
 from fuzzing import kinds
-from fuzzing.kinds import INTEGERS, SMALL_PICKLES, USD_LINES, edge_number, packed_integer, put
+from fuzzing.kinds import INTEGERS, SMALL_PICKLES, edge_number, packed_integer, put
 from fuzzing.repairs import joined, repair_glb, repair_portable, repair_tensors, split, with_checksum
 
 Fault = Callable[[bytes, Random], tuple[str, bytes]]
@@ -180,23 +180,6 @@ def _gzip_of_zeros(head: bytes, amount: int) -> bytes:
     return gzip.compress(head, 9, mtime=0) + member * -(-amount // (1 << 24))
 
 
-def faulty_spz(data: bytes, dice: Random) -> tuple[str, bytes]:
-    """Make a fault in the header or the columns of a .spz, or in the gzip around them."""
-    if not data.startswith(b"\x1f\x8b"):  # version 4
-        return kinds.faulty_bytes(data, dice, 130)
-    plain, kind = gzip.decompress(data), dice.choice((*("inner",) * 6, "claim", "bomb", "gzip", "members"))
-    if kind == "claim":  # as many Gaussians as it says, all of them zero
-        count, degree = dice.choice((100_000, 2_000_000, 2_000_001)), dice.randrange(5)
-        head = put(put(plain[:16], 8, count.to_bytes(4, "little")), 12, bytes([degree]))
-        return kind, _gzip_of_zeros(head, count * (20 + 3 * ((degree + 1) ** 2 - 1)))
-    if kind == "bomb":
-        return kind, _gzip_of_zeros(plain, dice.choice((1 << 30, 6 << 30)))
-    if kind == "gzip":
-        return kind, kinds.faulty_bytes(data, dice, 30)[1]
-    told, plain = kinds.faulty_bytes(plain, dice, 16) if kind == "inner" else (kind, plain)
-    return told, gzip.compress(plain, 1, mtime=0) * (dice.choice((2, 1000)) if kind == "members" else 1)
-
-
 def _faulty_header(content: Any, body: bytes, dice: Random) -> tuple[str, bytes, bytes]:
     """Make a fault in a json header, mostly in some of its larger parts, or in the numbers after it."""
     kind = dice.choice(("value",) * 6 + ("numbers", "cut", "text"))
@@ -323,8 +306,7 @@ def faulty_ply(data: bytes, dice: Random) -> tuple[str, bytes]:
 FORMATS: dict[str, Fault] = {
     ".json": faulty_json, ".partial": faulty_lines, ".csv": kinds.faulty_text, ".ply": faulty_ply, ".npy": faulty_npy,
     ".safetensors": faulty_repaired_tensors, ".mien": faulty_portable,
-    **dict.fromkeys((".npz", ".sog", ".usdz", ".frame"), faulty_zip), ".spz": faulty_spz, ".packed": faulty_packed,
-    ".glb": faulty_glb, ".png": faulty_png, ".pkl": faulty_pickle,
-    ".usda": lambda data, dice: kinds.faulty_text(data, dice, USD_LINES),
+    **dict.fromkeys((".npz", ".frame"), faulty_zip), ".packed": faulty_packed, ".glb": faulty_glb, ".png": faulty_png,
+    ".pkl": faulty_pickle,
 }  # fmt: skip
 """Faults by the ending of a file; others get faults of their bytes."""

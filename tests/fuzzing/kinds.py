@@ -33,12 +33,6 @@ LITERALS = (
     ":::", "double", "uchar", "int",
 )  # fmt: skip
 """Words of a text that is no json."""
-USD_LINES = tuple(line.replace("{name}", name) for name in ("other.usda", f"{CANARY}/x.usda") for line in (
-    "subLayers = [@{name}@]", "references = @{name}@", "payload = @{name}@", 'def "a" ( references = @{name}@ ) {}',
-    "asset file = @{name}@", "point3f[] positions.timeSamples = { 0: [(1, 2, 3)] }", "float[] opacities = [inf]",
-    "point3f[] positions.connect = </avatar.x>", 'variants = { string v = "x" }',
-    "matrix4d xformOp:transform = ((1,0,0,0),(0,1,0,0),(0,0,1,0),(0,0,0,nan))",
-))  # fmt: skip
 _TEBIBYTE = (1 << 40).to_bytes(8, "little")
 SMALL_PICKLES = {
     "bytes of a tebibyte": b"\x80\x04\x8e" + _TEBIBYTE + b".",

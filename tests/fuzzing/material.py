@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import wave
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +43,6 @@ from mien.formats import in_world, write_ply
 from mien.formats.gaussian_avatars import write_gaussian_avatars_folder
 from mien.formats.glb import MeshModel, write_glb
 from mien.formats.shared.packed import pack
-from mien.formats.sog import write_sog
-from mien.formats.spz import write_spz
-from mien.formats.usd import write_usd
 from mien.lab.analysis.registry import ANALYSES, AnalysisOptions, chosen_parts
 from mien.lab.analysis.running import run_analysis
 from mien.lab.analysis.study.files import ANSWERS, VERSION, KeyClip, StudyKey, shuffled, write_key
@@ -107,7 +103,7 @@ def make_material(root: Path, whole: bool = True) -> None:
     for write in (write for writers in LAYOUTS.values() for write in writers):
         write(root / "takes", [{"jawOpen": index / 8, "eyeBlinkLeft": 0.5} for index in range(4)])
     _write_films(root)
-    _write_splats(root / "splats", load_avatar(root / RUN))
+    _write_splats(root / "splats")
     _write_tables(root)
     if whole:
         _write_pieces(root / PIECES)
@@ -206,18 +202,15 @@ def _write_films(root: Path) -> None:
     (root / "alphas/._a.webp").write_bytes(b"\0\x05\x16\x07" + bytes(60))
 
 
-def _write_splats(folder: Path, avatar: Avatar) -> None:
-    """Write files of Gaussians as other programs do: line ends of Windows, doubles, packed, old and new .spz."""
-    from test_export import spz, written
+def _write_splats(folder: Path) -> None:
+    """Write files of Gaussians as other programs do: line ends of Windows, doubles, packed."""
+    from test_export import written
 
     folder.mkdir()
     written(folder / "doubles.ply", {"*": "float64", "label": "uint32"}, "\r\n")
     written(folder / "colors.ply", {"red": "uint8"}, "\r", 1)
     plain = (folder / "colors.ply").read_bytes()
     (folder / "packed.ply").write_bytes(plain.replace(b"end_header", b"property uint packed_position\rend_header", 1))
-    spz(folder / "old.spz", [(128, 127, 128), (255, 128, 127), (0, 127, 128)], 1)
-    with torch.no_grad():
-        write_spz(folder / "new.spz", in_world(avatar.pose(avatar.subject).gaussians.timestep(0)))
 
 
 def _write_tables(root: Path) -> None:
@@ -264,14 +257,6 @@ def _write_exports(root: Path, avatar: Avatar) -> None:
     with torch.no_grad():
         posed = in_world(avatar.pose(avatar.subject).gaussians.timestep(0))
     write_ply(root / "head.ply", posed)
-    higher = 0.1 * torch.randn(len(posed), 3, 3, generator=torch.Generator().manual_seed(0))
-    rich = replace(posed, sh=torch.cat([posed.sh[:, :1], higher], dim=1))  # which .sog shares in a palette
-    write_spz(folder / "head.spz", rich, version=3)  # the faults lie behind gzip
-    write_sog(folder / "head.sog", rich)
-    if find_spec("pxr") is not None:
-        for ending in ("usda", "usdc", "usdz"):
-            write_usd(folder / f"head.{ending}", [posed, posed][: 1 + (ending == "usda")], None)
-        shutil.copy(folder / "head.usdc", folder / "head.usd")
     model = avatar.face_model
     mesh = MeshModel(bake_rig(model, avatar.subject), *map(as_array, (model.faces, model.uv, model.uv_faces)))
     write_glb(folder / "head.glb", make_portable(avatar, toy_camera(32), "toy"), mesh, 16)

@@ -25,9 +25,6 @@ from mien.face.models.flame import flame_face_model, read_flame
 from mien.formats import read_ply
 from mien.formats.gaussian_avatars import read_gaussian_avatars_folder
 from mien.formats.glb import read_glb_avatar
-from mien.formats.sog import read_sog
-from mien.formats.spz import read_spz
-from mien.formats.usd import read_usd
 from mien.media.video import read_sound
 from mien.render.camera_paths import read_cameras
 from mien.runtime import read_portable
@@ -87,10 +84,6 @@ def _config(root: Path, file: Path) -> Any:
 def _on_flame(root: Path, file: Path) -> Any:
     model = flame_face_model(read_flame(root / "flame/tiny.npz"), "tiny")
     return read_gaussian_avatars_folder(root / "flame_avatars", model)
-
-
-def _read_splats(root: Path, file: Path) -> Any:
-    return {".ply": read_ply, ".spz": read_spz, ".sog": read_sog}.get(file.suffix, read_usd)(file)
 
 
 _TARGETS = (
@@ -161,11 +154,7 @@ _TARGETS = (
     Target("lines", "W/**/*", lambda root, file: None, lines.run_an_odd_line, 3, fault=lines.faulty_or_not, named=False,
            parts=lines.PARTS),
     Target("avatar of a .glb", "exports/head.glb", _of(read_glb_avatar), uses.use_portable, 2),
-    Target("head.spz", "exports/head.spz", _read_splats, uses.use_gaussians, 3),
-    Target("splats", "splats/*", _read_splats, uses.use_gaussians, 4),
-    Target("head.sog", "exports/head.sog", _read_splats, uses.use_gaussians, 3),
-    *(Target(f"head.{ending}", f"exports/head.{ending}", _read_splats, uses.use_gaussians, fault=faults.faulty_new_name)
-      for ending in ("usd", "usda", "usdc", "usdz")),
+    Target("splats", "splats/*", _of(read_ply), uses.use_gaussians, 4),
     Target("head.packed", "packed/*.packed", uses.read_in_node, weight=3, parts=("web",)),
     Target("head.mien in node", "head.mien", uses.read_in_node, parts=("web",)),
     Target("study.key.json", "study/study.key.json", uses.tally, exact=True),
@@ -178,7 +167,7 @@ TARGETS = {target.name: target for target in _TARGETS}
 
 
 def present(material: Path) -> list[str]:
-    """Return the targets whose files could be written here. Some need node, or USD's library."""
+    """Return the targets whose files could be written here. Some need node."""
     return [
         target.name
         for target in TARGETS.values()

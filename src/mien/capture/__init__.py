@@ -9,8 +9,8 @@
    measures blur and light (`quality`), and writes the pictures and their decoded cache (`frame_files`).
 5. `process` then writes the results of all frames beside the pictures and moves the folder to its place (`store`).
 
-`from_cameras` runs the same steps for the videos of a rig (`cameras/`). `capture` has the class `Capture`, and `store`
-writes and reads it.
+`from_cameras` runs the same steps for the videos of a rig (`cameras/`). `job` has what both share: the request, its
+key, and the folders of its work. `capture` has the class `Capture`, and `store` writes and reads it.
 """
 
 import lazy_loader

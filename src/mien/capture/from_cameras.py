@@ -11,12 +11,21 @@ import numpy as np
 from jaxtyping import Float
 
 from mien.camera import Camera
-from mien.capture import from_video
 from mien.capture.cameras import readings
 from mien.capture.cameras.calibration import CalibratedCamera, match_sources, read_calibration
 from mien.capture.cameras.head_path import HeadPath, choose_crops, disagreeing, find_head_path, project
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FrameLayout
+from mien.capture.job import (
+    RECIPE,
+    CaptureJob,
+    capture_once,
+    check_place,
+    cleaning_up,
+    open_job,
+    prepare,
+    read_finished,
+)
 from mien.capture.parts import Part, check_one_size
 from mien.capture.person.backend import detector_entry
 from mien.capture.person.crop import Crop
@@ -40,7 +49,7 @@ a false face, for example in hair seen from behind."""
 @dataclass(frozen=True, eq=False)
 class _View:
     camera_id: str
-    job: from_video.CaptureJob
+    job: CaptureJob
     survey: Survey
     person: Person
     camera: Camera
@@ -74,30 +83,28 @@ def capture_cameras(
 
     def work() -> Capture:
         _check_lengths(jobs, cameras)
-        from_video.check_place(out, whole)
-        with from_video.cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
-            views = _survey_views(jobs, cameras, from_video.prepare(survey_folder, whole.key))
+        check_place(out, whole)
+        with cleaning_up(out, partial_folder(out).with_suffix(".survey")) as survey_folder:
+            views = _survey_views(jobs, cameras, prepare(survey_folder, whole.key))
             _capture_views(views, whole, settings, out)
         return read_capture(out)
 
-    return from_video.capture_once(out, partial(from_video.read_finished, out, whole.key), work)
+    return capture_once(out, partial(read_finished, out, whole.key), work)
 
 
-def _job_of(
-    source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool
-) -> from_video.CaptureJob:
+def _job_of(source: Path, camera: CalibratedCamera, settings: CaptureSettings, replace_others: bool) -> CaptureJob:
     """Return the job of one camera, with its own files of those that settings name."""
     own = {
         option: _file_of(path, camera.camera_id, option.replace("_", "-"))
         for option in ("clean_plate", "mattes", "landmarks")
         if (path := getattr(settings, option)) is not None
     }
-    job = from_video.open_job(source, replace(settings, **own), camera.camera_id, replace_others)
+    job = open_job(source, replace(settings, **own), camera.camera_id, replace_others)
     selection = replace(job.frames.selection, offset=camera.offset)
     return replace(job, frames=replace(job.frames, selection=selection, lens=camera.lens, colors=camera.colors))
 
 
-def _check_size(job: from_video.CaptureJob, camera: CalibratedCamera) -> None:
+def _check_size(job: CaptureJob, camera: CalibratedCamera) -> None:
     """Check the first picture of a camera, before faces are searched in any."""
     if camera.offset and camera.offset >= job.frames.count():
         raise UserError(
@@ -108,7 +115,7 @@ def _check_size(job: from_video.CaptureJob, camera: CalibratedCamera) -> None:
     camera.for_pictures(width, height)
 
 
-def _check_lengths(jobs: list[from_video.CaptureJob], cameras: list[CalibratedCamera]) -> None:
+def _check_lengths(jobs: list[CaptureJob], cameras: list[CalibratedCamera]) -> None:
     """Check the numbers of frames without decoding any. With --capture.start or --capture.end, times decide."""
     selections = [job.frames.selection for job in jobs]
     if any(selection.start or selection.end for selection in selections):
@@ -140,9 +147,7 @@ def _file_of(folder: Path, camera_id: str, option: str) -> Path:
     return found[0]
 
 
-def _joined(
-    jobs: list[from_video.CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str
-) -> from_video.CaptureJob:
+def _joined(jobs: list[CaptureJob], cameras: list[CalibratedCamera], name: str, calibration: str) -> CaptureJob:
     """Return the job of the whole: the first camera's, under the sequence's name and a key over all of them."""
     rates = [job.frames.fps for job in jobs]
     for camera, rate in zip(cameras, rates, strict=True):
@@ -151,7 +156,7 @@ def _joined(
                 f"camera {camera.camera_id} has {rate:g} frames a second, camera {cameras[0].camera_id} {rates[0]:g}; "
                 "frames are paired by their number, so give videos of one rate"
             )
-    content = {"recipe": from_video.RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
+    content = {"recipe": RECIPE, "name": name, "calibration": calibration, "keys": [job.key for job in jobs]}
     if any(camera.lens for camera in cameras):
         content["straightened"] = True
     key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -159,7 +164,7 @@ def _joined(
     return replace(jobs[0], frames=replace(jobs[0].frames, content_hash=contents), name=name, key=key)
 
 
-def _survey_views(jobs: list[from_video.CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
+def _survey_views(jobs: list[CaptureJob], cameras: list[CalibratedCamera], folder: Path) -> list[_View]:
     views = []
     for job, camera in zip(jobs, cameras, strict=True):
         given = job.given()
@@ -173,7 +178,7 @@ def _survey_views(jobs: list[from_video.CaptureJob], cameras: list[CalibratedCam
     return views
 
 
-def _capture_views(views: list[_View], whole: from_video.CaptureJob, settings: CaptureSettings, out: Path) -> None:
+def _capture_views(views: list[_View], whole: CaptureJob, settings: CaptureSettings, out: Path) -> None:
     cameras = [view.camera for view in views]
     boxes = np.stack([view.person.boxes * np.tile(view.survey.picture_size, 2) for view in views], axis=1)
     path = find_head_path(boxes, cameras, lambda: _advice(views, boxes))
@@ -188,7 +193,7 @@ def _capture_views(views: list[_View], whole: from_video.CaptureJob, settings: C
             "cameras see it; check its calibration, its id and its offset"
         )
     crops, (width, height) = choose_crops(path, cameras, settings.size, settings.crop == "none")
-    work = from_video.prepare(partial_folder(out), whole.key)
+    work = prepare(partial_folder(out), whole.key)
     layout = FrameLayout(work, tuple(view.camera_id for view in views), len(path.centers), height, width)
     check_room(layout, whole.name, out)
     parts, chunks = [], []
@@ -234,7 +239,7 @@ def _readings(views: list[_View], parts: Sequence[Part] = ()) -> list[readings.R
 
 
 def _finish(
-    views: list[_View], whole: from_video.CaptureJob, path: HeadPath, parts: list[Part], layout: FrameLayout,
+    views: list[_View], whole: CaptureJob, path: HeadPath, parts: list[Part], layout: FrameLayout,
     chunks: list[list[Chunk]], out: Path,
 ) -> None:  # fmt: skip
     cameras = tuple(_cropped(view.camera, part.crop) for view, part in zip(views, parts, strict=True))

@@ -3,25 +3,31 @@
 Only a few frames are in memory at a time.
 """
 
-import hashlib
-import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, FrameLayout
+from mien.capture.job import (
+    CaptureJob,
+    capture_once,
+    check_place,
+    cleaning_up,
+    open_job,
+    part_in,
+    prepare,
+    read_finished,
+    read_source,
+)
 from mien.capture.parts import Part, check_one_size, find_parts, number_parts, tell_who, whole_part
-from mien.capture.person.backend import Detector, choose_detector, detector_entry
+from mien.capture.person.backend import Detector, detector_entry
 from mien.capture.person.faces import second_difference_jitter
-from mien.capture.person.given import GivenInputs, read_given, with_own_alpha
+from mien.capture.person.given import GivenInputs, with_own_alpha
 from mien.capture.person.people import face_shapes, group_people, shape_difference
 from mien.capture.person.survey import (
     Survey,
@@ -35,38 +41,14 @@ from mien.capture.person.survey import (
 from mien.capture.process import Chunk, Stream, finish, join_chunks, origin_of, process_part
 from mien.capture.quality import frame_rate, pace_report
 from mien.capture.settings import CaptureSettings
-from mien.capture.store import FORMAT, JSON_NAME, VERSION, check_replaceable, check_room, partial_folder, read_capture
-from mien.disk.files import cannot_write, file_digest, read_json, write_json
+from mien.capture.store import JSON_NAME, check_room, partial_folder, read_capture
 from mien.disk.locks import hold
-from mien.disk.reading import check_tree, has_other_names, remove_tree
+from mien.disk.reading import remove_tree
 from mien.errors import UserError
 from mien.machine.progress import say
-from mien.machine.terminal import plain_name
-from mien.media.source import FrameSelection, FrameSource, open_source
 
-RECIPE = 7
-"""Recipe version, raised whenever the same video would give another capture, so that old ones are made again."""
-STATE, _CHUNKS = "state.json", "chunks"
+_CHUNKS = "chunks"
 _NEIGHBORS = 4  # most captures of a workspace that a new one is compared with
-_Result = TypeVar("_Result", Capture, list[Capture])
-
-
-@dataclass(frozen=True)
-class CaptureJob:
-    """Request of the user: a source, a name and settings."""
-
-    frames: FrameSource
-    settings: CaptureSettings
-    name: str
-    key: str
-    replace: bool
-    """Whether a capture of another source may be replaced."""
-    detector: Detector = "mediapipe"
-
-    def given(self) -> GivenInputs:
-        """Read what the user gave besides the source."""
-        settings = self.settings
-        return read_given(self.frames, settings.clean_plate, settings.mattes, settings.landmarks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,16 +76,6 @@ def capture_video(
     """
     job = open_job(source, settings or CaptureSettings(), name, replace)
     return capture_once(out, partial(read_finished, out, _part_key(job, 1, 1)), partial(_capture_whole, out, job))
-
-
-def capture_once(folder: Path, read: Callable[[bool], _Result | None], work: Callable[[], _Result]) -> _Result:
-    """Return what is finished already, or else do the work under the folder's lock. `read` may tell of damage."""
-    finished = read(False)
-    if finished:
-        return finished
-    with hold(folder):
-        # Another process may have finished it before this one got the lock.
-        return read(True) or work()
 
 
 def _capture_whole(out: Path, job: CaptureJob) -> Capture:
@@ -203,7 +175,7 @@ def check_neighbors(
             other = read_capture(json_path.parent)
         except UserError:
             continue  # whoever uses it says what is wrong with it
-        if name in (folder.name, _part_in(other.source).get("of")):
+        if name in (folder.name, part_in(other.source).get("of")):
             continue
         shapes = face_shapes(pictures, detector) if shapes is None else shapes
         difference = shape_difference(shapes, face_shapes(other.images[:, 0], detector))
@@ -216,29 +188,6 @@ def check_neighbors(
             "much as those of one person do at most; give another workspace with --out, or --capture.person 0 if it is "
             "the same person"
         )
-
-
-def open_job(source: Path, settings: CaptureSettings, name: str | None, replace_others: bool) -> CaptureJob:
-    """Open a source and compute the key of its capture. Its frames are not read."""
-    settings.check()
-    selection = FrameSelection(settings.start, settings.end, settings.stride, settings.max_frames)
-    turns = settings.turn // 90
-    frames = open_source(source, selection, settings.fps, turns, settings.deinterlace, settings.stream)
-    name = name or plain_name(source.resolve().stem)
-    # Files enter the key by their content, not by their path.
-    contents = {
-        "clean_plate": file_digest(settings.clean_plate) if settings.clean_plate else None,
-        "landmarks": file_digest(settings.landmarks) if settings.landmarks else None,
-        "mattes": open_source(settings.mattes, FrameSelection(), 25.0).content_hash if settings.mattes else None,
-    }
-    detector = "mediapipe" if settings.landmarks and settings.mattes else choose_detector(settings.detector)
-    own = asdict(settings) | contents
-    del own["detector"]
-    content = {
-        "recipe": RECIPE, "source": frames.content_hash, "name": name, "settings": own | detector_entry(detector),
-    }  # fmt: skip
-    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    return CaptureJob(frames, settings, name, key, replace_others, detector)
 
 
 def _part_key(job: CaptureJob, number: int, count: int) -> str:
@@ -254,7 +203,7 @@ def _read_finished_parts(sequences: Path, job: CaptureJob, tell: bool = True) ->
     whole = read_finished(_capture_dir(sequences, job.name), _part_key(job, 1, 1), tell)
     if whole is not None:
         return [whole]
-    count = _part_in(_read_source(_capture_dir(sequences, f"{job.name}-1"))).get("count")
+    count = part_in(read_source(_capture_dir(sequences, f"{job.name}-1"))).get("count")
     if not isinstance(count, int):
         return []
     found: list[Capture] = []
@@ -264,61 +213,6 @@ def _read_finished_parts(sequences: Path, job: CaptureJob, tell: bool = True) ->
             return []
         found.append(capture)
     return found
-
-
-def check_place(out: Path, job: CaptureJob) -> None:
-    """Refuse to replace anything but a capture of the same source, or of any source if the user allows it."""
-    try:
-        check_replaceable(out)
-    except OSError as error:
-        raise cannot_write(out, error) from None
-    if job.replace or not (out / JSON_NAME).exists():
-        return
-    source = _read_source(out)
-    if source is None:
-        say(f"{out}: the capture in it is damaged or of another version; it is made again")
-    elif source.get("content_hash") != job.frames.content_hash:
-        raise UserError(
-            f"{out}: holds a capture of another source ({source.get('file', 'not made from a video')}); choose another "
-            "name with --name, or add --replace to `mien capture`"
-        )
-
-
-@contextmanager
-def cleaning_up(out: Path, survey_folder: Path) -> Iterator[Path]:
-    """Yield the folder for the survey and remove it at the end. After a UserError, remove new empty folders too."""
-    missing = [folder for folder in (out.parent, *out.parent.parents) if not folder.exists()]
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # one thread detects and another refines and writes; more would slow them down
-    try:
-        yield survey_folder
-    except OSError as error:
-        raise cannot_write(out, error) from None
-    except UserError:
-        remove_tree(survey_folder)
-        for folder in missing:
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
-        raise
-    finally:
-        cv2.setNumThreads(threads)
-    remove_tree(survey_folder)
-
-
-def prepare(work: Path, key: str) -> Path:
-    """Prepare a folder for unfinished work. Its content is kept only if it belongs to the same key."""
-    try:
-        kept = read_json(work / STATE, "mien.capture_state", 1).get("key") == key
-        # Links could make mien write somewhere else, and mien never makes any.
-        check_tree(work)
-        kept = kept and not work.is_symlink() and not has_other_names(work)
-    except UserError:
-        kept = False
-    if not kept:
-        remove_tree(work)
-        work.mkdir(parents=True)
-        write_json(work / STATE, "mien.capture_state", 1, {"key": key})
-    return work
 
 
 def _run_survey(job: CaptureJob, folder: Path) -> tuple[Survey, GivenInputs]:
@@ -385,37 +279,9 @@ def _finish(job: CaptureJob, draft: Draft, place: tuple[int, int], given: GivenI
 def _tell_leftovers(sequences: Path, job: CaptureJob, names: set[str]) -> None:
     """Warn about sequences that an earlier capture of the same video left under other names."""
     for path in sorted(sequences.glob(f"*/capture/{JSON_NAME}")):
-        is_ours = _part_in(_read_source(path.parent)).get("of") == job.name
+        is_ours = part_in(read_source(path.parent)).get("of") == job.name
         if is_ours and path.parent.parent.name not in names:
             say(
                 f"warning: {path.parent.parent}: is left over from an earlier capture of {job.name}; "
                 "delete it if you do not need it"
             )
-
-
-def _read_source(out: Path) -> dict[str, Any] | None:
-    """Return the `source` entry of the capture in a folder, or None if there is no readable capture."""
-    try:
-        source = read_json(out / JSON_NAME, FORMAT, VERSION).get("source")
-    except UserError:
-        return None
-    return source if isinstance(source, dict) else None
-
-
-def _part_in(source: dict[str, Any] | None) -> dict[str, Any]:
-    """Return the entry of a capture's `source` about the video that it is a part of, if it has one."""
-    part = (source or {}).get("part")
-    return part if isinstance(part, dict) else {}
-
-
-def read_finished(out: Path, key: str, tell: bool = True) -> Capture | None:
-    """Return the capture in a folder if it has this `key` and is intact. `tell` reports a damaged one."""
-    source = _read_source(out)
-    if source is None or source.get("key") != key:
-        return None
-    try:
-        return read_capture(out)
-    except UserError as error:
-        if tell:
-            say(f"{str(error).split('; ')[0]}; it is captured again")
-        return None

@@ -175,8 +175,7 @@ def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, La
         content = parse_json(read_bytes(file, 4 << 20).decode("utf-8"))  # those of one model have some 10 kB
         if content["topology_hash"] != model.topology_hash:
             raise UserError(
-                f"{file}: the landmarks of {name} were made for another mesh: run "
-                f"python -m mien.tracking.landmarks {name}"
+                f"{file}: the landmarks of {name} were made for another mesh: run python benchmarks/landmarks.py {name}"
             )
         return {str(key): _landmarks(marks, model) for key, marks in content["landmarks"].items()}
 

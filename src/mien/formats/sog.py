@@ -13,13 +13,9 @@ import numpy as np
 from PIL import Image
 
 from mien.disk.files import write_atomically
-from mien.disk.limits import checked_whole
-from mien.disk.reading import open_archive, open_member, open_ordinary, parse_json
-from mien.errors import UserError
 from mien.formats.format import Content, SplatOptions, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
+from mien.formats.shared.splats import finite_arrays, unit_quats
 from mien.gaussians import Gaussians
-from mien.media.decoding import announced_size
 
 _VERSION, _CODES, _PALETTE_COLUMNS, _MODE = 2, 256, 64, 252
 """Numbers of the specification."""
@@ -27,10 +23,8 @@ _MIN_SCALE = 1e-7
 """Least standard deviation in metres, so that Gaussians without a width do not take values from the others."""
 _BANDS = {3: 1, 8: 2, 15: 3}
 """Number of bands by the number of SH coefficients after the first."""
-_MAX_MEMBER, _MAX_META = 1 << 26, 1 << 20
-_PALETTE, _SPARE_PIXELS = 1 << 16, 1 << 16
-"""Most rows of coefficients that Gaussians share; and pixels that a picture may have besides two for each Gaussian,
-since other programs round its sides up."""
+_PALETTE = 1 << 16
+"""Most rows of coefficients that Gaussians share."""
 
 
 def write_sog(path: Path, gaussians: Gaussians) -> None:
@@ -70,69 +64,6 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
         for name, data in members.items():
             archive.writestr(zipfile.ZipInfo(name), data)
     write_atomically(path, lambda temporary: temporary.write_bytes(file.getvalue()))
-
-
-def read_sog(path: Path) -> Gaussians:
-    """Read a .sog file of version 2."""
-    try:
-        with open_ordinary(path) as file, open_archive(file) as members:
-            meta = parse_json(_member(members, "meta.json", _MAX_META).decode())
-            if meta["version"] != _VERSION:
-                raise ValueError(f"it has version {meta['version']!r:.20}")
-            try:
-                checked_whole(meta["count"], 0, MAX_GAUSSIANS)
-            except ValueError:
-                most = f"at most {MAX_GAUSSIANS:,} are read"
-                raise ValueError(f"it has {meta['count']!r:.20} Gaussians, and {most}") from None
-            with np.errstate(over="ignore"):  # infinity is told below
-                arrays = _decoded(members, meta)
-    except Exception as error:  # damaged archives and pictures may fail in any way
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path}: cannot be read as .sog ({str(reason)[:100]}); "
-                        "give a .sog of version 2, as `mien export` writes") from None  # fmt: skip
-    gaussians = gaussians_of(arrays)
-    finite_arrays(path, gaussians)
-    return gaussians
-
-
-def _decoded(members: zipfile.ZipFile, meta: dict[str, Any]) -> tuple[np.ndarray, ...]:
-    count = meta["count"]
-
-    def pixels(part: str, index: int, channels: int) -> np.ndarray:
-        data = _member(members, meta[part]["files"][index])
-        size, most = announced_size(data), _PALETTE * 15 if (part, index) == ("shN", 0) else 2 * count
-        if size is None or size[0] * size[1] > most + _SPARE_PIXELS:
-            raise ValueError(f"{part} has more pixels than its {count:,} Gaussians need")
-        with Image.open(io.BytesIO(data)) as picture:
-            if picture.size != size:
-                raise ValueError(f"{part} has two sizes")
-            values = np.asarray(picture.convert("RGBA")).reshape(-1, 4)[:, :channels]
-        if part != "shN" or index == 1:
-            if len(values) < count:
-                raise ValueError(f"{part} has too few pixels")
-            return values[:count]
-        return values
-
-    def book(part: str, kind: type = np.float32) -> np.ndarray:
-        values = np.array(meta[part]["codebook"], kind)
-        if values.shape != (_CODES,):
-            raise ValueError(f"{part} has no codebook of {_CODES} numbers")
-        return values
-
-    steps = pixels("means", 0, 3).astype(int) + 256 * pixels("means", 1, 3).astype(int)
-    low, high = (np.array(meta["means"][name], np.float64) for name in ("mins", "maxs"))
-    logged = low + (high - low) * steps / 65535
-    shades = pixels("sh0", 0, 4)
-    sh = book("sh0")[shades[:, :3]][:, None]
-    if "shN" in meta:
-        rest = (checked_whole(meta["shN"]["bands"], 1, 3) + 1) ** 2 - 1
-        labels = pixels("shN", 1, 2).astype(int) @ np.array([1, 256])
-        palette = pixels("shN", 0, 3).reshape(-1, rest, 3)
-        sh = np.concatenate([sh, book("shN")[palette[labels]]], axis=1)
-    return (
-        np.sign(logged) * np.expm1(np.abs(logged)), _unpacked_quats(pixels("quats", 0, 4)),
-        np.exp(book("scales", np.float64)[pixels("scales", 0, 3)]), shades[:, 3] / 255, sh,
-    )  # fmt: skip
 
 
 def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
@@ -199,18 +130,6 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return np.concatenate([codes, largest[:, None] + _MODE], axis=1).astype(np.uint8)
 
 
-def _unpacked_quats(pixels: np.ndarray) -> np.ndarray:
-    largest = pixels[:, 3].astype(int) - _MODE
-    if (largest < 0).any():
-        raise ValueError("a rotation has an unknown mode")
-    kept = (pixels[:, :3] / 255 - 0.5) * np.sqrt(2)
-    quats = np.zeros((len(pixels), 4))
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    np.put_along_axis(quats, others, kept, 1)
-    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(1 - (kept**2).sum(1), 0))
-    return quats
-
-
 def _picture(values: np.ndarray, width: int) -> bytes:
     """Rows of 3 or 4 bytes as the pixels of a lossless WebP picture. The last line ends with zeros."""
     height = max(1, -(-len(values) // width))
@@ -221,14 +140,6 @@ def _picture(values: np.ndarray, width: int) -> bytes:
     picture = Image.fromarray(pixels.reshape(height, width, -1))
     picture.save(file, "WEBP", lossless=True, exact=True, quality=20, method=2)
     return file.getvalue()
-
-
-def _member(members: zipfile.ZipFile, name: str, most: int = _MAX_MEMBER) -> bytes:
-    described = members.getinfo(str(name))
-    if described.file_size > most:
-        raise ValueError(f"{described.filename!r:.40} is too large")
-    with open_member(members, described) as file:
-        return file.read(most)
 
 
 def write(path: Path, content: Content, options: SplatOptions) -> str:

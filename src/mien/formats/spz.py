@@ -6,7 +6,6 @@ which describes the headers, the order of the columns and their bits.
 """
 
 import gzip
-import io
 import math
 import struct
 from dataclasses import dataclass
@@ -16,10 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mien.disk.files import write_atomically
-from mien.disk.reading import read_bytes
 from mien.errors import UserError
 from mien.formats.format import Content, PoseOptions, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
+from mien.formats.shared.splats import finite_arrays, unit_quats
 
 if TYPE_CHECKING:
     import mien.gaussians
@@ -36,7 +34,6 @@ _COLOR_SCALE = 0.15
 _LOG_SCALE_OFFSET, _LOG_SCALE_STEPS = 10, 16
 _SH_STEPS = 128
 _QUAT_STEPS = 511
-_MAX_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -74,30 +71,6 @@ def write_spz(path: Path, gaussians: "mien.gaussians.Gaussians", version: Litera
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
-def read_spz(path: Path) -> "mien.gaussians.Gaussians":
-    """Read a .spz file of version 2 (whose quaternions have three bytes), 3 or 4."""
-    try:
-        packed = read_bytes(path, _MAX_BYTES)
-        read = _read_version_4 if packed[:4] == struct.pack("<I", _MAGIC) else _read_gzip
-        fraction, columns = read(packed)
-    except Exception as error:  # damaged streams may fail in any way
-        reason = getattr(error, "strerror", None) or error
-        remedy = "give a .spz of version 2, 3 or 4; `mien export` writes 4"
-        raise UserError(f"{path}: cannot be read as .spz ({reason}); {remedy}") from None
-    places, opacities, colors, scales, quats, higher = columns
-    count = len(places)
-    wide = np.concatenate([np.zeros((count, 3, 1), np.uint8), places], axis=2)
-    means = (wide.reshape(count, 12).view("<i4") >> 8) / 2**fraction
-    first = (colors.astype(np.float32) / 255 - 0.5) / _COLOR_SCALE
-    higher = higher.astype(np.float32)
-    higher -= _SH_STEPS  # in place: these are most of the numbers
-    higher /= _SH_STEPS
-    sh = np.concatenate([first[:, None], higher], axis=1)
-    quats = _unpacked_quats(quats) if quats.shape[1] == 4 else _unpacked_first_three(quats)
-    scales = np.exp(scales.astype(np.float64) / _LOG_SCALE_STEPS - _LOG_SCALE_OFFSET)
-    return gaussians_of((means, quats, scales, opacities / 255, sh))
-
-
 def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
     import zstandard
 
@@ -109,68 +82,8 @@ def _in_version_4(parts: list[bytes], facts: tuple[int, ...]) -> bytes:
     return b"".join([header.ljust(_TABLE_AT, b"\0"), table, *packed])
 
 
-def _shapes(count: int, degree: int, quat_bytes: int = 4) -> list[tuple[int, ...]]:
-    if count > MAX_GAUSSIANS:
-        raise ValueError(f"it has {count:,} Gaussians, and at most {MAX_GAUSSIANS:,} are read")
-    return [(count, 3, 3), (count,), (count, 3), (count, 3), (count, quat_bytes), (count, (degree + 1) ** 2 - 1, 3)]
-
-
-def _read_gzip(packed: bytes) -> tuple[int, list[np.ndarray]]:
-    """The number of bits behind the point, and all columns, of a file of version 2 or 3."""
-    with gzip.GzipFile(fileobj=io.BytesIO(packed)) as file:
-        magic, version, count, degree, fraction, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-        if magic != _MAGIC:
-            raise ValueError("it has another beginning")
-        _check_header(version, (2, 3), degree, fraction)
-        return fraction, [_column(file, shape) for shape in _shapes(count, degree, 3 if version == 2 else 4)]
-
-
-def _check_header(version: int, known: tuple[int, ...], degree: int, fraction: int) -> None:
-    if version not in known:
-        raise ValueError(f"it is of version {version}")
-    if degree > 3 or fraction > _FIXED_BITS:
-        raise ValueError("its header is damaged")
-
-
-def _read_version_4(packed: bytes) -> tuple[int, list[np.ndarray]]:
-    """The number of bits behind the point, and all columns, of a file of version 4."""
-    import zstandard
-
-    _, version, count, degree, fraction, _, streams = _HEADER.unpack_from(packed)
-    (table,) = struct.unpack_from("<I", packed, _HEADER.size)
-    _check_header(version, (4,), degree, fraction)
-    shapes, columns = _shapes(count, degree), []
-    if streams != sum(bool(np.prod(shape)) for shape in shapes) or table < _TABLE_AT:
-        raise ValueError("its table is damaged")
-    entry, at = table, table + streams * _ENTRY.size
-    for shape in shapes:
-        size = int(np.prod(shape))
-        if not size:
-            columns.append(np.zeros(shape, np.uint8))
-            continue
-        small, large = _ENTRY.unpack_from(packed, entry)
-        part = packed[at : at + small]
-        # The size is known, so a stream that would fill the memory is refused before it is unpacked.
-        if large != size or len(part) < small or zstandard.frame_content_size(part) not in (size, -1):
-            raise ValueError("it is truncated, or a column has another size")
-        data = zstandard.ZstdDecompressor().decompress(part, max_output_size=size)
-        if len(data) != size:
-            raise ValueError("a column has another size")
-        columns.append(np.frombuffer(data, np.uint8).reshape(shape))
-        entry, at = entry + _ENTRY.size, at + small
-    return fraction, columns
-
-
 def _bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
-
-
-def _column(file: gzip.GzipFile, shape: tuple[int, ...]) -> np.ndarray:
-    size = int(np.prod(shape))
-    data = file.read(size)
-    if len(data) < size:
-        raise ValueError("it is truncated")
-    return np.frombuffer(data, np.uint8).reshape(shape)
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
@@ -184,24 +97,6 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     for component in range(4):
         word = np.where(largest == component, word, (word << 10) | fields[:, component])
     return word.astype("<u4").view(np.uint8).reshape(-1, 4)
-
-
-def _unpacked_first_three(packed: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz of version 2, which has x, y and z of those whose w is not negative."""
-    xyz = packed / 127.5 - 1
-    return np.concatenate([np.sqrt(np.maximum(1 - (xyz**2).sum(1, keepdims=True), 0)), xyz], axis=1)
-
-
-def _unpacked_quats(packed: np.ndarray) -> np.ndarray:
-    word = np.ascontiguousarray(packed).view("<u4")[:, 0].astype(np.int64)
-    largest, quats = word >> 30, np.zeros((len(word), 4))
-    for component in (3, 2, 1, 0):
-        stored = largest != component
-        size = (word & _QUAT_STEPS) / _QUAT_STEPS / np.sqrt(2)
-        quats[:, component] = np.where(stored, np.where(word & 512, -size, size), 0)
-        word = np.where(stored, word >> 10, word)
-    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(1 - (quats**2).sum(1), 0))
-    return quats[:, [3, 0, 1, 2]]
 
 
 def write(path: Path, content: Content, options: SpzOptions) -> str:

@@ -15,20 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mien.disk.files import write_atomically
-from mien.disk.reading import open_ordinary
 from mien.errors import UserError
 from mien.formats.format import Content, PoseOptions, check_options, pose_words
-from mien.formats.shared.splats import MAX_GAUSSIANS, finite_arrays, gaussians_of, unit_quats
+from mien.formats.shared.splats import finite_arrays, unit_quats
 
 if TYPE_CHECKING:
     import mien.gaussians
 
-_MAX_BYTES = 1 << 28
-_REMEDY = "give a USD file of `mien export`"
-
 
 def check_usd(path: Path, options: PoseOptions | None = None) -> None:
-    """Check the options, if any, and that usd-core, which writes and reads `path`, is installed."""
+    """Check the options, if any, and that usd-core, which writes `path`, is installed."""
     if options is not None:
         check_options(path, options)
     if importlib.util.find_spec("pxr") is None:
@@ -64,69 +60,6 @@ def write_usd(path: Path, poses: Iterable["mien.gaussians.Gaussians"], fps: floa
 
     write_atomically(path, write)
     return count
-
-
-def read_usd(path: Path, time: float | None = None) -> "mien.gaussians.Gaussians":
-    """Read the Gaussians of a USD file at a time sample (default: without time)."""
-    check_usd(path)
-    Tf, Usd, UsdVol = _pxr("Tf", "Usd", "UsdVol")
-    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-    try:
-        stage = Usd.Stage.Open(_layer_alone(path))
-        prims = (prim for prim in stage.Traverse() if prim.IsA(UsdVol.ParticleField3DGaussianSplat))
-        field = UsdVol.ParticleField3DGaussianSplat(next(prims))
-        attributes = (
-            field.GetPositionsAttr(), field.GetOrientationsAttr(), field.GetScalesAttr(), field.GetOpacitiesAttr(),
-            field.GetRadianceSphericalHarmonicsCoefficientsAttr(),
-        )  # fmt: skip
-        values = [attribute.Get(at) for attribute in attributes]
-    except (Tf.ErrorException, StopIteration):
-        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
-    if any(value is None for value in values):
-        raise UserError(f"{path}: has no Gaussians at time {time}; give a time of its samples")
-    try:
-        gaussians = _gaussians_of(values)
-    except (ValueError, TypeError, OverflowError):
-        raise UserError(f"{path}: its arrays do not fit each other; {_REMEDY}") from None
-    finite_arrays(path, gaussians)
-    return gaussians
-
-
-def _gaussians_of(values: list[Any]) -> "mien.gaussians.Gaussians":
-    """Gaussians of the attributes of a field. A ValueError tells that their lengths do not fit each other."""
-    means, turns, scales, opacities, sh = (np.array(value, np.float32) for value in values)
-    count = len(means)
-    coefficients = len(sh) // max(count, 1)
-    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count * coefficients, 3))
-    if any(array.shape != shape for array, shape in zip((means, turns, scales, opacities, sh), shapes, strict=True)):
-        raise ValueError
-    if count > MAX_GAUSSIANS or (count and coefficients not in (1, 4, 9, 16)):
-        raise ValueError
-    return gaussians_of((means, turns[:, [3, 0, 1, 2]], scales, opacities, sh.reshape(count, coefficients, 3)))
-
-
-def _layer_alone(path: Path) -> Any:
-    """The layer of a file, if it refers to no other file. A stranger's file could name any on this machine."""
-    (Sdf,) = _pxr("Sdf")
-    try:
-        with open_ordinary(path) as file:  # USD would wait for a pipe
-            size = os.fstat(file.fileno()).st_size
-    except (OSError, ValueError):
-        raise UserError(f"{path}: is missing, damaged, or has no Gaussians; {_REMEDY}") from None
-    if path.suffix.lower() not in (".usd", ".usda", ".usdc", ".usdz") or size > _MAX_BYTES:
-        raise UserError(f"{path}: has no ending of USD, or more than {_MAX_BYTES:,} bytes; {_REMEDY}")
-    layer = Sdf.Layer.FindOrOpen(str(path.absolute()))
-    if layer is None:
-        raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
-    places: list[Any] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, places.append)
-    found = [layer.GetPrimAtPath(place) for place in places if place.IsPrimPath()]
-    # USD ends the whole process where it uses a prim without a name.
-    if any(place.isEmpty for place in places) or not all(found):
-        raise UserError(f"{path}: is damaged, or not a USD file; {_REMEDY}")
-    if any(prim.HasInfo("clips") for prim in found) or layer.GetCompositionAssetDependencies():
-        raise UserError(f"{path}: refers to other files, which are not opened; flatten it into one file")
-    return layer
 
 
 def _pxr(*names: str) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Parts that files of Gaussians in a pose share: checked arrays and unit rotations. Torch is needed to read."""
+"""Parts that files of Gaussians in a pose share: checked arrays and unit rotations."""
 
 from collections.abc import Iterable
 from pathlib import Path

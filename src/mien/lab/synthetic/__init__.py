@@ -9,7 +9,6 @@ The order of the files:
 - `painter` draws the posed person with the light and the materials of `shading`. `arithmetic` has the noise and the
   ramps of all of these.
 - `scene` joins them into frames; `captures` writes whole captures; `truth` stores what is known exactly.
-- `detector_calibration` measures a landmark detector on drawn people.
 """
 
 import lazy_loader

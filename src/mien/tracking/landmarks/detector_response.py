@@ -2,7 +2,7 @@
 
 The embedding gives the point of the surface for each landmark. But a detector has habits. It puts the chin where its
 annotators did, closes eyelids too late, turns heads too little, and gets the shape of every person slightly wrong.
-`mien.lab.synthetic.detector_calibration` measures these habits on synthetic people.
+`benchmarks/detector_calibration.py` measures these habits on synthetic people.
 """
 
 from dataclasses import dataclass, replace
@@ -110,5 +110,5 @@ def write_response(
     np.savez_compressed(
         path, rest_sigma=1e3 * response.rest_sigma, people=people, topology_hash=face_model.topology_hash,
         content_hash=face_model.content_hash,
-        command=f"python -m mien.lab.synthetic.detector_calibration {face_model.name}{ending}", **arrays,
+        command=f"python benchmarks/detector_calibration.py {face_model.name}{ending}", **arrays,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""MediaPipe's 478 landmarks, placed on a face model (`python -m mien.tracking.landmarks NAME`).
+"""MediaPipe's 478 landmarks, placed on a face model (`python benchmarks/landmarks.py NAME`).
 
 This works for any FaceModel. It draws the model with random identities, mild expressions, gazes and views, runs the
 landmark detector on the pictures, and takes for each landmark the point of the surface that projects nearest to the

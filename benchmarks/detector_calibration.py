@@ -1,4 +1,4 @@
-"""Measure where a detector finds a face model's points: `python -m mien.lab.synthetic.detector_calibration anny`.
+"""Measure where a detector finds a face model's points: `python benchmarks/detector_calibration.py anny`.
 
 It draws people through many kinds of lenses, runs the detector on them, and fits a `DetectorResponse`. The result ships
 with mien (src/mien/tracking/data). Run this only after a change of a face model, its landmarks or the painter: 200

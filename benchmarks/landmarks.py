@@ -1,4 +1,4 @@
-"""Place MediaPipe's 478 landmarks on a face model: `python -m mien.tracking.landmarks anny`."""
+"""Place MediaPipe's 478 landmarks on a face model: `python benchmarks/landmarks.py anny`."""
 
 from dataclasses import replace
 from importlib import resources
@@ -22,7 +22,7 @@ def main(name: tyro.conf.Positional[str] = "anny", pictures: int = EmbeddingSett
     landmarks, errors = embed_landmarks(model, EmbeddingSettings(pictures=pictures))
     median = float(errors.median())
     path = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
-    command = f"python -m mien.tracking.landmarks {name}"
+    command = f"python benchmarks/landmarks.py {name}"
     write_landmarks(path, replace(model, landmarks=landmarks), command, median)
     say(f"{path}: median error {median:.2f} px, largest {float(errors.max()):.2f} px (landmark {int(errors.argmax())})")
 
