@@ -77,5 +77,3 @@ def run_batch(root: Path, found: object, dice: Random) -> None:
         finally:
             for row in Batch(out).read_plan() if out.exists() else ():
                 assert getattr(Batch(out).read_state(row.name), "status", "") in ("failed", "done")
-    if out.exists():
-        run_line("batch table {root}/batch", root)
