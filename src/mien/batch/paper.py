@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mien.batch.plan import Batch
-from mien.batch.results import latex_table, markdown_table, mean_of
+from mien.batch.results import latex_table, markdown_table, mean_of, numbers
 from mien.disk.config import no_such_setting, overlay
 from mien.disk.files import write_atomically
 from mien.disk.reading import read_bytes
@@ -123,8 +123,8 @@ def _state(line: Line, own: Sequence[dict[str, Any]], paper: Paper) -> str:
     """What our figures of a line are: a whole run, a short one with what it lacks, or none."""
     if not (line.method and own):
         return "not run" if line.method else "the paper's figures alone"
-    steps = min(row.get("steps") or 0 for row in own)
-    short = [f"{steps:,} of {line.steps:,} steps"] if steps < line.steps else []
+    steps = min(numbers(own, "steps"), default=0)
+    short = [f"{steps:,.0f} of {line.steps:,} steps"] if steps < line.steps else []
     short += [f"{len(own)} of {counted(paper.subjects, 'subject')}"] if len(own) < paper.subjects else []
     state = f"run short: {', '.join(short)}" if short else f"run: {counted(len(own), 'subject')}"
     return state + (f"; with {paper.typed}" if paper.typed else "")

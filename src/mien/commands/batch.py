@@ -5,7 +5,7 @@ import json
 import shlex
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -137,8 +137,9 @@ class Run:
             return read_table(self.table, self.for_all)[: self.subjects or None], None
         usual = columns_of(self.for_all)
         paper = with_runs(read_paper(self.paper), self.paper, usual)
-        entries = read_entries(self.table, usual, paper=True)[: self.subjects or None]
-        rows = subject_rows(entries, paper)
+        entries = read_entries(self.table, usual, paper=True)
+        paper = replace(paper, subjects=max(paper.subjects, len(entries)))
+        rows = subject_rows(entries[: self.subjects or None], paper)
         if any(row.first for row in rows) and (self.shard or self.store):
             raise UserError(f"--paper {self.paper}: subjects drive each other; leave --shard and --store out")
         return rows, paper

@@ -133,7 +133,8 @@ def _options(person: Person, paper: Paper, line: Line, given: Words) -> Words:
 
 
 def _words(options: Mapping[str, Any]) -> dict[str, list[str]]:
-    lists = {key: value if isinstance(value, list) else [value] for key, value in options.items()}
+    """The words of the options of a table. An empty text leaves an option out."""
+    lists = {key: value if isinstance(value, list) else [value] for key, value in options.items() if value != ""}
     return {key: [str(each).lower() if isinstance(each, bool) else str(each) for each in lists[key]] for key in lists}
 
 
