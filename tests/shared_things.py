@@ -3,14 +3,20 @@ Folders are for reading: a test that changes one copies it first."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import train_toy
+from mien.batch import drive
+from mien.batch.plan import Batch, Row, State
+from mien.batch.row import do_steps, run_row
 from mien.capture import write_capture
 from mien.capture.capture import Capture
 from mien.capture.store import read_capture_hash
+from mien.cli import main
 from mien.evaluation import evaluate
 from mien.evaluation.protocols import EvaluationSettings
 from mien.tracking import write_tracking
@@ -55,3 +61,14 @@ def toy_workspace(made_once: MadeOnce) -> Path:
 def evaluated_workspace(made_once: MadeOnce) -> Path:
     """Return the same with the figures of its run."""
     return made_once("evaluated_workspace", write_evaluated_workspace)
+
+
+def rows_here(monkeypatch: pytest.MonkeyPatch, run: Callable[[list[str]], int] = main) -> list[list[str]]:
+    """Let the rows of `mien batch` run in this process, and return the list of their commands, which grows."""
+    seen: list[list[str]] = []
+
+    def attempt(root: Path, program: object, threads: object, row: Row) -> State | None:
+        return run_row(Batch(root), row, partial(do_steps, lambda words: seen.append(words) or run(words)))
+
+    monkeypatch.setattr(drive, "attempt", attempt)
+    return seen

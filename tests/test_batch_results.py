@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from batch_stub import PROGRAM
+from mien.batch.paper import write_table
 from mien.batch.plan import Batch, Row, State
-from mien.batch.results import latex_table, markdown_table, means_by, write_results, write_wall
+from mien.batch.results import write_results, write_wall
 from mien.batch.row import write_strip
 from mien.cli import main
 from mien.commands import batch as batch_command
@@ -49,15 +50,14 @@ def test_results_have_all_figures_and_paired_differences(tmp_path: Path):
     assert difference["mean"] == -1.5
     # t(0.975, 1) = 12.7062, standard error 0.5
     assert difference["interval"] == pytest.approx([-7.8531, 4.8531], abs=1e-4)
-    table = means_by(rows, "method", ["psnr", "lpips"])
-    assert table == [
-        ["method", "n", "psnr", "lpips"],
-        ["a", "2", "30.50 ± 0.71", "0.100 ± 0.000"],
-        ["b", "2", "32.00 ± 1.41", "0.100 ± 0.000"],
+    write_table(batch, rows, None)
+    assert (tmp_path / "table.md").read_text().splitlines() == [
+        "|  | PSNR, dB | SSIM | ST-LPIPS | state |",
+        "|---|---|---|---|---|",
+        "| a | 30.50 ± 0.71 | - | 0.100 ± 0.000 | run short: 2 of 3 subjects |",
+        "| b | 32.00 ± 1.41 | - | 0.100 ± 0.000 | run short: 2 of 3 subjects |",
     ]
-    assert markdown_table(table).splitlines()[1] == "|---|---|---|---|"
-    assert r"30.50 $\pm$ 0.71" in latex_table(table)
-    refuses("no such column", means_by, rows, "gone", ["psnr"])
+    assert r"30.50 $\pm$ 0.71" in (tmp_path / "table.tex").read_text()
 
 
 @pytest.mark.slow
@@ -86,12 +86,10 @@ def test_the_wall_shows_the_worst_first_and_escapes_texts(tmp_path: Path):
             assert strip.size == (12 * 160, 160)
 
 
-def test_status_and_table_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+def test_status_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
     scored(Batch(tmp_path))
     assert main(["batch", "status", str(tmp_path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["counts"] == {"done": 2, "failed": 1}
-    assert main(["batch", "table", str(tmp_path), "--rows", "light", "--columns", "psnr"]) == 0
-    assert "| sun | 2 |" in capsys.readouterr().out
     # A missing engine is told before rows are read.
     monkeypatch.setattr(batch_command.importlib.util, "find_spec", lambda name: None)
     (tmp_path / "table.csv").write_text("nonsense\n")
@@ -103,7 +101,6 @@ def test_what_makes_no_sense_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     scored(Batch(Path("DIR")))
     Path("TABLE").write_text("video\n")
-    Batch(Path("EMPTY")).write_plan([Row("ann", (("create",),), fingerprint="a")])
     Batch(Path("OTHER")).write_plan([])
     plan = Path("OTHER/plan.json")
     plan.write_text(plan.read_text().replace('"version": 1', '"version": 99'))
@@ -114,7 +111,6 @@ def test_what_makes_no_sense_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ('TABLE --out DIR --program "echo \'x"', "--program echo 'x: No closing quotation"),
         ("TABLE --out DIR --store nosuch://x", "nosuch://x: cannot be reached"),
         ("status TABLE", "is not the folder of a batch"),
-        ("table EMPTY", "no row is done yet"),
         ("status OTHER", "version 99, expected 'mien.batch' version 1"),
     ):
         assert told in complaint(capsys, "batch", *shlex.split(line))
@@ -245,7 +241,7 @@ def test_mistakes_in_a_table_are_named_before_any_work(table: Path):
 
 def test_the_driver_imports_neither_torch_nor_what_only_rows_need(table: Path, tmp_path: Path):
     run = ["batch", str(table), "--out", "people", "--program", shlex.join(PROGRAM)]
-    looks = [["batch", "status", "people"], ["batch", "table", "people", "--columns", "psnr"]]
+    looks = [["batch", "status", "people"]]
     for lines, needed in (([run], {"av", "cv2", "mien._native"}), (looks, {"mien._native"})):
         for code, modules in modules_after(lines, tmp_path):
             assert code == 0

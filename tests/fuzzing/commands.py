@@ -8,7 +8,9 @@ import numpy as np
 import safetensors.numpy
 
 from fuzzing.uses import SEEN, run_line, use_capture
+from mien.batch.paper import write_table
 from mien.batch.plan import Batch
+from mien.batch.results import write_results
 from mien.capture import read_capture
 from mien.capture.from_video import capture_video_parts
 from mien.capture.settings import CaptureSettings
@@ -78,4 +80,4 @@ def run_batch(root: Path, found: object, dice: Random) -> None:
             for row in Batch(out).read_plan() if out.exists() else ():
                 assert getattr(Batch(out).read_state(row.name), "status", "") in ("failed", "done")
     if out.exists():
-        run_line("batch table {root}/batch", root)
+        write_table(Batch(out), write_results(Batch(out)), None)

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +23,8 @@ from mien.errors import UserError
 PLAN, STATE = ("mien.batch", 1), ("mien.batch-row", 1)
 WORKSPACE = "{workspace}"
 """Stands for the row's workspace in the words of its steps."""
+ROWS = "{rows}"
+"""Stands for the folder of the workspaces of all rows."""
 _AGAIN = "run `mien batch TABLE --out DIR` again"
 _Number = Annotated[float, Range(0, 1e15)]
 """A number of which many can be added up."""
@@ -40,6 +43,8 @@ class Row:
     """Memory that the row needs, in megabytes."""
     fingerprint: str = ""
     """Digest of the steps and of the sizes and times of the input files. A row that is done is done for this one."""
+    first: bool = False
+    """Whether the row has to end before others begin, which use what it makes."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,11 @@ class Batch:
     def workspace(self, name: str) -> Path:
         """The row's workspace."""
         return self.place("rows", name)
+
+    def words(self, row: Row, step: Sequence[str]) -> list[str]:
+        """The words of a step of a row, with its workspace in them."""
+        places = {WORKSPACE: self.workspace(row.name), ROWS: self.root / "rows"}
+        return [reduce(lambda text, mark: text.replace(mark, str(places[mark])), places, word) for word in step]
 
     def place(self, *names: str) -> Path:
         """The path of a folder of the batch, or of something in it. Somebody else may have filled it."""

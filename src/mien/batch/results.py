@@ -11,19 +11,17 @@ from typing import Any
 
 from mien.batch.plan import Batch
 from mien.disk.files import write_atomically
-from mien.errors import UserError
 from mien.machine.terminal import counted
 from mien.pages.pages import COLUMNS, LIVING_PAGE, render
 
 HEADINGS = {name: heading for name, heading, _, _ in COLUMNS}
 HIGHER = {name: higher for name, _, _, higher in COLUMNS}
 DIGITS = {name: digits for name, _, digits, _ in COLUMNS}
-ALIASES = {"lpips": "perceptual", "head_lpips": "head_perceptual"}
-"""Short names of columns. The figure is ST-LPIPS."""
+DIGITS |= {"lpips": 4, "seconds_per_frame": 4, "gaussians": 0, "training_hours": 2}
 
 RESULT_COLUMNS = frozenset(
     {"name", "status", "run", "method", "tries", "host", "mien", "row_seconds", "peak_mb", "error"}
-    | {*HIGHER, *ALIASES} | {f"head_{name}" for name in HIGHER}
+    | {*HIGHER} | {f"head_{name}" for name in HIGHER}
 )  # fmt: skip
 """Columns of the results that no label may have."""
 
@@ -106,23 +104,9 @@ def interval(values: Sequence[float]) -> list[float] | None:
     return [float(mean - half), float(mean + half)]
 
 
-def means_by(rows: Sequence[dict[str, Any]], by: str, columns: Sequence[str]) -> list[list[str]]:
-    """A table of means: a heading, then a line for each value of the column `by`."""
-    known = dict.fromkeys(itertools.chain.from_iterable(rows))
-    for name in (by, *columns):
-        if ALIASES.get(name, name) not in known:
-            raise UserError(f"{name}: the results have no such column; there are: {', '.join(known)}")
-    finished = [row for row in rows if row.get("method")]
-    table = [[by, "n", *columns]]
-    for value in dict.fromkeys(str(row.get(by, "")) for row in finished):
-        own = [row for row in finished if str(row.get(by, "")) == value]
-        table.append([value, str(len(own)), *(_mean(own, ALIASES.get(column, column)) for column in columns)])
-    return table
-
-
-def _mean(rows: Sequence[dict[str, Any]], column: str) -> str:
-    values = numbers(rows, column)
-    digits = DIGITS.get(column.removeprefix("head_"), 1)
+def mean_of(rows: Sequence[dict[str, Any]], column: str) -> str:
+    """The mean of a column in words, with the standard deviation of several numbers; "-" if there are none."""
+    values, digits = numbers(rows, column), DIGITS.get(column.rpartition(".")[2], 3)
     if not values:
         return "-"
     spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""

@@ -6,6 +6,7 @@ and waits for it, wherever an engine calls it. If `attempt` dies, the row's stan
 """
 
 import json
+import math
 import os
 import shlex
 import signal
@@ -14,7 +15,7 @@ import subprocess
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import mien
-from mien.batch.plan import WORKSPACE, Batch, Row, State
+from mien.batch.plan import Batch, Row, State
 from mien.batch.store import fetched
 from mien.disk.config import decode
 from mien.disk.files import write_atomically
@@ -204,9 +205,7 @@ def _stop_at_end(given: IO[str]) -> None:
 
 def repeat_command(batch: Batch, row: Row) -> str:
     """The commands that repeat a row here, for a shell."""
-    workspace = str(batch.workspace(row.name))
-    steps = [[word.replace(WORKSPACE, workspace) for word in step] for step in row.steps]
-    return " && ".join(shlex.join(["mien", *step]) for step in steps)
+    return " && ".join(shlex.join(["mien", *batch.words(row, step)]) for step in row.steps)
 
 
 def do_steps(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
@@ -214,7 +213,7 @@ def do_steps(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], 
     workspace = batch.workspace(row.name)
     stages: defaultdict[str, float] = defaultdict(float)
     for step in row.steps:
-        words = [fetched(word.replace(WORKSPACE, str(workspace)), batch.place("inputs")) for word in step]
+        words = [fetched(word, batch.place("inputs")) for word in batch.words(row, step)]
         ended = threading.Event()
         sampler = threading.Thread(target=_sample, args=(step[0], stages, ended), daemon=True)
         sampler.start()
@@ -255,11 +254,28 @@ def figures_of(batch: Batch, name: str, run_dir: Path) -> dict[str, Any]:
         for part, prefix in ((None, ""), ("head", "head_")):
             for metric in METRICS:
                 found[prefix + metric] = None if scored is None else figure(scored, part, metric)
+        found |= protocol_figures(content["protocols"])
         found |= {key: content["training"].get(key) for key in ("gaussians", "steps", "seconds")}
-        found["training_seconds"] = found.pop("seconds")
+        found["training_seconds"] = seconds = found.pop("seconds")
+        found["training_hours"] = None if seconds is None else seconds / 3600
     if (run_dir / "film.mp4").is_file():
         thumbnail = batch.place("thumbs", f"{name}.{run_dir.name}.jpg")
         write_atomically(thumbnail, partial(write_strip, run_dir / "film.mp4"))
+    return found
+
+
+def protocol_figures(protocols: Mapping[str, Any]) -> dict[str, float]:
+    """The figures of each protocol by its name, a dot and theirs; and with fitted faces, if those were scored.
+
+    MonoGaussianAvatar's protocol erodes and dilates drawings of fitted faces (`opened`).
+    """
+    found: dict[str, float] = {}
+    for name, entry in protocols.items():
+        place = "self_reenactment" if name.startswith("self_reenactment") else name
+        fitted = entry.get("opened", entry["fitted"]) if "fitted" in entry else {}
+        for prefix, part in ((place, entry), (f"{place}.fitted", fitted)):
+            numbers = {key: value for key, value in part.items() if isinstance(value, float) and math.isfinite(value)}
+            found = {f"{prefix}.{key}": value for key, value in numbers.items()} | found
     return found
 
 

@@ -5,14 +5,15 @@ import json
 import shlex
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import tyro
 
 from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
-from mien.batch.plan import Batch, Options
+from mien.batch.paper import Paper
+from mien.batch.plan import Batch, Options, Row
 from mien.disk.config import Range
 from mien.errors import UserError
 from mien.machine.terminal import show
@@ -28,15 +29,18 @@ class Run:
     --preset draft, count for all rows; a cell of the table goes first.
 
     mien batch status DIR: how far each row is, what failed and why, and when it will be done.
-
-    mien batch table DIR: means by a column of the results, as Markdown and LaTeX.
     """
 
     takes_more: ClassVar[bool] = True
     table: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TABLE")]
-    """A csv or json of captures, or a folder of videos."""
+    """A csv or json of captures, or a folder of videos. With --paper also a folder with a dataset for each subject."""
     out: Path
     """Folder of the batch, new or existing."""
+    paper: Path | None = None
+    """A table of a paper (examples/papers/NAME.toml), which says what is trained and how it is scored. table.md then
+    has our means over subjects beside the paper's figures."""
+    subjects: Annotated[int, _COUNT] = 0
+    """Use only the first so many subjects. 0 means all."""
     on: Literal["local", "slurm", "ray"] = "local"
     """The engine that runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
     shard: str = ""
@@ -89,13 +93,13 @@ class Run:
     def run(self) -> None:
         """Run the rows, and write the results."""
         from mien.batch.drive import drive
+        from mien.batch.paper import write_table
         from mien.batch.progress import batch_progress, progress_text
         from mien.batch.results import write_results, write_wall
-        from mien.commands.batch_table import read_table
         from mien.machine.progress import say
         from mien.machine.terminal import counted
 
-        batch, rows, known = Batch(self.out), read_table(self.table, self.for_all), []
+        batch, (rows, paper), known = Batch(self.out), self._rows(), []
         labels = dict.fromkeys(label for row in rows for label in row.labels)
         if labels:
             say(f"labels, which come back in the results: {', '.join(labels)}")
@@ -110,15 +114,35 @@ class Run:
         options = Options(
             self.on, self.jobs, self.threads, *cluster, retry=self.retry, store=self.store, program=self._program()
         )
-        drive(batch, shard_of(rows, self.shard) if self.shard else rows, options)
-        write_wall(batch, write_results(batch))
+        chosen = shard_of(rows, self.shard) if self.shard else rows
+        for some in ([row for row in chosen if row.first], [row for row in chosen if not row.first]):
+            drive(batch, some, options)
+        write_wall(batch, results := write_results(batch))
+        write_table(batch, results, paper)
         progress = batch_progress(batch)
         for line in progress_text(progress).splitlines():
             say(line)
-        say(f"Look at {self.out / 'index.html'}; the figures are in {self.out / 'results.csv'}")
+        say(f"Look at {self.out / 'index.html'}; the figures are in {self.out / 'results.csv'} and table.md")
         failed, status = progress["counts"].get("failed", 0), f"mien batch status {shlex.quote(str(self.out))}"
         if failed:
             raise UserError(f"{failed} of {counted(len(rows), 'row')} failed; see `{status}`")
+
+    def _rows(self) -> tuple[list[Row], Paper | None]:
+        """The rows, and the table of the paper."""
+        from mien.batch.paper import read_paper
+        from mien.commands.batch_paper import subject_rows, with_runs
+        from mien.commands.batch_table import columns_of, read_entries, read_table
+
+        if self.paper is None:
+            return read_table(self.table, self.for_all)[: self.subjects or None], None
+        usual = columns_of(self.for_all)
+        paper = with_runs(read_paper(self.paper), self.paper, usual)
+        entries = read_entries(self.table, usual, paper=True)
+        paper = replace(paper, subjects=max(paper.subjects, len(entries)))
+        rows = subject_rows(entries[: self.subjects or None], paper)
+        if any(row.first for row in rows) and (self.shard or self.store):
+            raise UserError(f"--paper {self.paper}: subjects drive each other; leave --shard and --store out")
+        return rows, paper
 
     def _program(self) -> tuple[str, ...]:
         try:
@@ -150,32 +174,4 @@ class Status:
             time.sleep(5)
 
 
-@dataclass(frozen=True)
-class Table:
-    """Print means of the results by a column, and write them as Markdown and LaTeX."""
-
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder of the batch."""
-    rows: str = "method"
-    """Column of the results whose values are the lines."""
-    columns: str = "psnr,ssim,lpips"
-    """Columns of the results whose means are shown, separated by commas."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print json on standard output, for programs."""
-
-    def run(self) -> None:
-        """Print and write the table."""
-        from mien.batch.results import latex_table, markdown_table, means_by, result_rows
-        from mien.disk.files import write_atomically
-
-        batch, columns = Batch(self.folder), [each.strip() for each in self.columns.split(",") if each.strip()]
-        rows, status = result_rows(batch), f"mien batch status {shlex.quote(str(batch.root))}"
-        if not any(row.get("method") for row in rows):
-            raise UserError(f"{batch.root}: no row is done yet, so there is nothing to show; see `{status}`")
-        table = means_by(rows, self.rows, columns)
-        for name, text in (("table.md", markdown_table(table)), ("table.tex", latex_table(table))):
-            write_atomically(batch.root / name, lambda aside, text=text: aside.write_text(text, encoding="utf-8"))
-        show(json.dumps(table) if self.as_json else markdown_table(table).rstrip())
-
-
-TASKS = {"": Run, "status": Status, "table": Table}
+TASKS = {"": Run, "status": Status}

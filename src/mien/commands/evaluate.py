@@ -58,6 +58,8 @@ class Run:
     beside those as tracked and corrected, never the headline. It takes longer."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
     """Number of optimiser steps of --fit-faces, for each held-out timestep."""
+    resume: bool = False
+    """Leave a run that was scored with the same settings as it is, unless drivers are given."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the result as json on standard output, for programs."""
 
@@ -79,7 +81,9 @@ class Run:
             **chosen,
         )  # fmt: skip
         workspace = open_workspace(self.workspace)
-        metrics = run_evaluation_stage(workspace, workspace.pick_run(self.run_name), settings, self.drivers)
+        metrics = run_evaluation_stage(
+            workspace, workspace.pick_run(self.run_name), settings, self.drivers, again=not self.resume
+        )
         if self.as_json:
             show(json.dumps(metrics, indent=1))
 

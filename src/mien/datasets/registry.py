@@ -48,7 +48,7 @@ def recognised(path: Path) -> tuple[Dataset, str]:
     """Return the dataset whose files are at a path, and what it found there."""
     found = [(each, told) for each in datasets() if (told := _told(each, path)) is not None]
     if not found:
-        people = _people(path)
+        people = people_in(path)
         if people:
             told = (
                 f"holds {len(people)} people ({', '.join(people[:_MAX_NAMED])}{', ...' * (len(people) > _MAX_NAMED)})"
@@ -61,7 +61,7 @@ def recognised(path: Path) -> tuple[Dataset, str]:
     return found[0]
 
 
-def _people(path: Path) -> list[str]:
+def people_in(path: Path) -> list[str]:
     """The names of folders inside a folder that are each a dataset of one person."""
     try:
         inside = [each for each in listed(path) if each.is_dir()]
