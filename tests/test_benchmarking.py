@@ -7,18 +7,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import method_steps
 import numpy as np
 import pytest
-import step_parts
 import torch
 
 from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
+from mien.lab.benchmarking import method_steps, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
-from mien.lab.benchmarking import train_step
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, thread_counts, time_function
 from mien.training.trainer import step
 from refusals import complaint

@@ -83,6 +83,7 @@ def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
     ("track here --tracking.keyframes -1", ("--tracking.keyframes -1",)),
     ("bench nothing", ("nothing", "render, train-step, scaling, quality, compare")),
     ("bench scaling --plot chart.jpg", ("charts are written as .svg",)),
+    ("bench train-step --parts --method headgas", ("--parts --method headgas",)),
     ("bench train-step --seconds=0", ("--seconds 0: give a number above 0",)),
     ("evaluate x --protocol None", ("--protocol", "{insta,imavatar,nersemble", "['None']")),
     ("capture x --out y --capture.turn 45", ("'45'", "'--capture.turn'. Expected one of ('0', '90', '180', '270')")),

@@ -1,7 +1,7 @@
 """Measure this machine and this version of mien."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,14 +14,17 @@ from mien.commands.train_options import check_method, listed_methods
 from mien.disk.config import POSITIVE, Range
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
+from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
 from mien.lab.synthetic.recipe import PEOPLE
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
 from mien.machine.terminal import show
+from mien.plugins import named
 
 if TYPE_CHECKING:
+    StepMethod = str
     CaptureName = str
 else:
-    CaptureName = Literal[tuple(PEOPLE["references"])]
+    StepMethod, CaptureName = Literal[tuple(STEP_BENCHMARKS)], Literal[tuple(PEOPLE["references"])]
 
 
 @dataclass(frozen=True)
@@ -80,25 +83,42 @@ class Scaling(_Timed):
 
 @dataclass(frozen=True)
 class TrainStep(_Timed):
-    """Measure a training step of the default method (no footage is needed), and posing together with drawing."""
+    """Measure a training step (no footage is needed), and posing together with drawing."""
 
+    method: StepMethod = DEFAULT_METHOD
+    """Method to measure. All but the default are measured on the CPU at 512x512, with the sizes of their papers or of
+    the preset standard."""
+    parts: bool = False
+    """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
+    A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
+    fastest round."""
     seconds: Annotated[float, POSITIVE] = 3.0
     """Seconds to spend on each row. More time finds a smaller minimum on a busy machine."""
     device: DeviceName = "cpu"
     """Device to train on. cuda measures a GPU, where gsplat draws, at the sizes of the papers."""
 
     def check(self) -> None:
-        """Check that CUDA has gsplat."""
+        """Check that CUDA has gsplat, and that the options fit together."""
         check_device(self.device)
+        if self.method not in GPU_BENCHMARKS and self.device == "cuda":
+            raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
+        if self.parts and self.method != DEFAULT_METHOD:
+            raise UserError(f"--parts --method {self.method}: only {DEFAULT_METHOD} has parts; leave out one")
+        if self.parts and self.device == "cuda":
+            raise UserError("--parts --device cuda: parts are measured on the CPU only; leave out --device")
 
     def run(self) -> None:
         """Measure and print the rows."""
-        from mien.lab.benchmarking.train_step import gpu_rows, train_step_suite
+        if self.parts:
+            from mien.lab.benchmarking.step_parts import format_parts, parts_suite
 
+            show_rows(parts_suite(self.seconds), self.as_json, as_text=format_parts)
+            return
         device = choose_device(self.device)
-        on_gpu = device.type == "cuda"
-        rows = gpu_rows(like_on(device), self.seconds) if on_gpu else train_step_suite(self.seconds)
-        show_rows(rows, self.as_json, gpu=on_gpu)
+        if device.type == "cuda" and self.method in GPU_BENCHMARKS:
+            show_rows(named(GPU_BENCHMARKS[self.method])(like_on(device), self.seconds), self.as_json, gpu=True)
+        else:
+            show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)
 
 
 @dataclass(frozen=True)
@@ -202,8 +222,10 @@ class Compare:
 TASKS = {"render": Render, "train-step": TrainStep, "scaling": Scaling, "quality": Quality, "compare": Compare}
 
 
-def show_rows(rows: Iterable[Any], as_json: bool, gpu: bool = False) -> list[Any]:
-    """Print the machine, and each row once it is measured, or everything as json, with one thread."""
+def show_rows(
+    rows: Iterable[Any], as_json: bool, gpu: bool = False, as_text: Callable[[Any], str] | None = None
+) -> list[Any]:
+    """Print the machine, and each row (or list of rows) once it is measured, or everything as json, with one thread."""
     import torch
 
     from mien.lab.benchmarking.timing import format_machine, format_row, measure_machine
@@ -214,8 +236,8 @@ def show_rows(rows: Iterable[Any], as_json: bool, gpu: bool = False) -> list[Any
         show(format_machine(machine))
     for row in rows:
         if not as_json:
-            show(format_row(row))
-        shown.append(row)
+            show(as_text(row) if as_text else format_row(row))
+        shown += row if isinstance(row, list) else [row]
     if as_json:
         show(json.dumps({"machine": asdict(machine), "rows": [asdict(row) for row in shown]}))
     return shown

@@ -1,4 +1,4 @@
-"""Measure where a training step of the default method spends its time: `python benchmarks/step_parts.py --seconds 3`.
+"""Measure the parts of a training step of the default method (`mien bench train-step --parts`).
 
 Each native operation has a row of its own. What remains of a phase is the work of Python and PyTorch in it.
 """
@@ -11,7 +11,6 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-import tyro
 
 from mien import _native
 from mien.avatar.methods import DEFAULT_METHOD
@@ -197,18 +196,3 @@ def _watched(watch: Stopwatch, state: TrainingState) -> Iterator[None]:
             if callable(operation) and not isinstance(operation, type) and not name.startswith("_"):
                 stack.enter_context(patch.object(_native, name, watch.operation(name, operation)))
         yield
-
-
-def main(seconds: float = 3.0) -> None:
-    """Print a table for one thread and one for all: 45,000 Gaussians at 512x512, with all losses, on the CPU.
-
-    Args:
-        seconds: Seconds to spend on each table.
-    """
-    torch.set_num_threads(1)
-    for rows in parts_suite(seconds):
-        print(format_parts(rows))
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

@@ -1,17 +1,10 @@
-"""Measure training steps of `headgas` and `mono_gaussian_avatar`, as `mien train` runs them, and frames of both.
-
-    python benchmarks/method_steps.py mono-gaussian-avatar --seconds 3
-
-`mien bench train-step` measures those of the default method.
-"""
+"""Measure training steps of `headgas` and `mono_gaussian_avatar`, as `mien train` runs them, and frames of both."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count as counting
-from typing import Literal
 
 import torch
-import tyro
 
 from mien import runtime
 from mien.avatar.baking import make_portable
@@ -23,7 +16,7 @@ from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.lab.benchmarking import train_step
-from mien.lab.benchmarking.timing import BenchmarkRow, format_row, rows_by_threads
+from mien.lab.benchmarking.timing import BenchmarkRow, rows_by_threads
 from mien.training.checkpoint import TrainingState
 from mien.training.trainer import TrainingData, start
 
@@ -150,19 +143,3 @@ def _fill_mono(avatar: MonoGaussianAvatar, count: int) -> None:
     for network in (avatar.attributes, avatar.deformation, avatar.change):
         for parameter in network.parameters():
             parameter.add_(0.01 * torch.randn(parameter.shape, generator=generator))
-
-
-def main(method: tyro.conf.Positional[Literal["headgas", "mono-gaussian-avatar"]], seconds: float = 3.0) -> None:
-    """Print the rows of one method, at 512x512 on the CPU.
-
-    Args:
-        method: The method.
-        seconds: Seconds to spend on each row.
-    """
-    torch.set_num_threads(1)
-    for row in {"headgas": headgas_suite, "mono-gaussian-avatar": mono_suite}[method](seconds):
-        print(format_row(row))
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
