@@ -27,14 +27,13 @@ from mien.gaussians import Gaussians, Rendering
 from mien.machine.devices import choose_device, gpu_memory_mb, like_on
 from mien.training import TrainSettings, batch, train, trainer
 from mien.training.checkpoint import TrainingState
-from mien.training.footage.frames import FrameOrder, training_frames
-from mien.training.footage.sequence import Sequence, Targets
-from mien.training.trainer import TrainingData, start, step
+from mien.training.footage.sequence import Sequence
+from mien.training.trainer import start, step
 from mien.training.whole_head.hair_surface import HairSurface
 from plain_settings import plain_config, plain_run
 from refusals import refuses
 from shared_things import toy_workspace
-from toy_scene import toy_sequence
+from toy_scene import toy_data, toy_sequence
 from train_toy import silence, stopped_at
 
 SETTINGS = replace(train_toy.SETTINGS, steps=12, record_every=1)
@@ -51,8 +50,7 @@ def train_some(
 ) -> TrainingState:
     """Return the state after training with this dtype and device."""
     face_model, sequence = scene
-    order = FrameOrder(training_frames([sequence], settings), settings.seed)
-    data = TrainingData(order, (Targets(sequence, settings.resolution, like=like),))
+    data = toy_data(sequence, settings, like)
     state = start([sequence], face_model, config, settings, like)
     for _ in range(settings.steps):
         step(state, data, settings)
@@ -196,8 +194,7 @@ def test_a_step_of_training_asks_for_no_number(config: MethodConfig, monkeypatch
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = plain_run(steps=1_000_000, split="none", background="random", record_every=1_000_000)
     state = trainer.start([sequence], face_model, config, settings, META)
-    order = FrameOrder(training_frames([sequence], settings), settings.seed)
-    data = trainer.TrainingData(order, (Targets(sequence, 0, like=META),))
+    data = toy_data(sequence, settings, META)
     for _ in range(3):
         trainer.step(state, data, settings)
     state.track.steady_pose()

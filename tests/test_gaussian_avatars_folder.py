@@ -22,7 +22,7 @@ from mien.formats.gaussian_avatars import read_gaussian_avatars_folder, write_ga
 from mien.render import rasterize
 from plain_settings import plain_gaussian_avatars
 from refusals import refuses
-from toy_scene import toy_camera, toy_face, toy_face_model
+from toy_scene import moved, toy_camera, toy_face, toy_face_model
 
 CAMERA = toy_camera(64)
 EQUAL = 1e-4
@@ -32,10 +32,8 @@ def new_avatar(face_model: FaceModel, face: FaceParams, **config: object) -> Ava
     """Return an avatar of GaussianAvatars with several Gaussians on some triangles, whose values are all random."""
     avatar = METHODS["gaussian_avatars"].avatar(plain_gaussian_avatars(**config), face_model, face)
     avatar.store.append(torch.arange(0, len(face_model.faces), 3))
-    generator = torch.Generator().manual_seed(1)
+    moved(avatar, 0.2)
     with torch.no_grad():
-        for parameter in avatar.parameters():
-            parameter.add_(0.2 * torch.randn(parameter.shape, generator=generator))
         avatar.store["opacity_logits"].add_(3)
     return avatar
 

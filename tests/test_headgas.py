@@ -30,7 +30,7 @@ from mien.runtime import pose, read_portable, write_portable
 from mien.training import PRESETS
 from mien.training.adam import Adam
 from test_feature_network import product
-from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model
+from toy_scene import moved, runtime_face, toy_camera, toy_face, toy_face_model
 
 SMALL = HeadGasConfig(
     points=40, features=5, directions=0, sh_degree=1, sh_warmup=0.0, sh_higher_share=1.0, judged_expressions=0
@@ -203,11 +203,8 @@ VARIANT = HeadGasConfig(points=40, features=5, hidden=8, sh_degree=1, sh_warmup=
 
 def new_variant(variant: Variant, disturbed: bool = True) -> HeadGas:
     avatar = new_avatar(replace(VARIANT, variant=variant))
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for name, parameter in avatar.named_parameters():
-            if disturbed and not name.endswith("means"):
-                parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    if disturbed:
+        moved(avatar, 0.1, but="means")
     return avatar
 
 

@@ -228,13 +228,7 @@ def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor
     return sampled[0, :, 0].T.reshape(*uv.shape[:-1], -1)
 
 
-def antialias_reference(
-    image: Float[Tensor, "h w c"],
-    fragments: MeshFragments,
-    points: Float[Tensor, "v 3"],
-    faces: Int[Tensor, "f 3"],
-    edges: MeshEdges,
-) -> Float[Tensor, "h w c"]:
+def antialias_reference(image, fragments, points, faces, edges) -> Float[Tensor, "h w c"]:
     """Reference of `mien.render.mesh_gradients.antialias`."""
     inner, outer, position = _crossings(fragments, points, faces, edges)
     beyond = position - 0.5
@@ -243,16 +237,8 @@ def antialias_reference(
     return flat.index_add(0, changed, beyond.abs()[:, None] * (flat[other] - flat[changed])).view(image.shape)
 
 
-def mesh_loss_reference(
-    fragments: MeshFragments,
-    points: Float[Tensor, "v 3"],
-    normals: Float[Tensor, "v 3"],
-    mesh: LitMesh,
-    texture: Float[Tensor, "th tw 3"],
-    light: Float[Tensor, "9 3"],
-    target: tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], float],
-) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 3"]]:
-    """Reference of `mien.render.mesh_gradients.mesh_loss`; also returns the drawn picture."""
+def mesh_loss_reference(fragments, points, normals, mesh, texture, light, target) -> tuple[Tensor, Tensor]:
+    """Take what `mien.render.mesh_gradients.mesh_loss` takes, and return its value and the drawn picture."""
     image, mask, epsilon = target
     seen = MeshFragments(fragments.face_index, barycentrics_reference(fragments, points, mesh.faces), fragments.depth)
     corners = torch.arange(3 * len(mesh.faces)).view(-1, 3)

@@ -28,13 +28,11 @@ from mien.formats.shared.packed import pack
 from mien.render import rasterize
 from mien.training import TrainSettings
 from mien.training.checkpoint import TrainingState, resume, write_checkpoint
-from mien.training.footage.frames import FrameOrder, training_frames
-from mien.training.footage.sequence import Targets
 from mien.training.trainer import TrainingData, start, step
 from plain_settings import plain_config, plain_gaussian_avatars, plain_mono_gaussian_avatar, plain_run
 from refusals import refuses
 from test_feature_network import product
-from toy_scene import runtime_face, toy_camera, toy_face, toy_face_model, toy_sequence
+from toy_scene import moved, runtime_face, toy_camera, toy_data, toy_face, toy_face_model, toy_sequence
 
 SIZE = 32
 FIRST, LAST = slice(0, 5), slice(-5, None)
@@ -67,17 +65,12 @@ def new_avatar(method: str, disturbed: bool = False) -> Avatar:
     torch.manual_seed(0)
     config = replace(CONFIGS[method], photometric=replace(CONFIGS[method].photometric, alpha_weight=0.125))
     avatar = METHODS[method.split("-")[0]].avatar(config, face_model, sequence.tracking.face)
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in avatar.parameters() if disturbed else ():
-            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-    return avatar
+    return moved(avatar, 0.1) if disturbed else avatar
 
 
 def started(config: MethodConfig, settings: TrainSettings = SETTINGS) -> tuple[TrainingState, TrainingData]:
     face_model, sequence = toy_sequence(5, SIZE)
-    data = TrainingData(FrameOrder(training_frames([sequence], settings), 0), (Targets(sequence, 0),))
-    return start([sequence], face_model, config, settings), data
+    return start([sequence], face_model, config, settings), toy_data(sequence, settings)
 
 
 @pytest.mark.unchecked

@@ -34,7 +34,7 @@ from mien.runtime import posing
 from mien.runtime.baked import BlendSkinned
 from plain_settings import plain_mono_gaussian_avatar, plain_point_avatar
 from refusals import refuses
-from toy_scene import random, rgb_from_sh, runtime_face, toy_camera, toy_face, toy_face_model
+from toy_scene import moved, random, rgb_from_sh, runtime_face, toy_camera, toy_face, toy_face_model
 
 SMALL = plain_point_avatar(points=30, max_points=100, face_points=30)
 
@@ -225,11 +225,7 @@ def moved_avatar(method: str) -> Avatar:
         avatar.store.assign("bases", torch.randn(avatar.store["bases"].shape))
     else:
         avatar = mono_avatars.new_avatar()
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in avatar.parameters():
-            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
-    avatar.eval()
+    moved(avatar, 0.02).eval()
     return avatar
 
 

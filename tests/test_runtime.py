@@ -25,7 +25,7 @@ from mien.render import rasterize
 from mien.runtime.posing import Gaussians, run_network
 from plain_settings import plain_config
 from refusals import refuses
-from toy_scene import runtime_face, toy_camera, toy_sequence
+from toy_scene import moved, runtime_face, toy_camera, toy_sequence
 
 SIZE = 64
 method = pytest.mark.parametrize("method", METHODS)
@@ -36,12 +36,7 @@ def new_avatar(method: str, **config: object) -> Avatar:
     face_model, sequence = toy_sequence(5, SIZE)
     torch.manual_seed(0)
     settings = replace(plain_config(method), **config)  # type: ignore[arg-type]
-    avatar = METHODS[method].avatar(settings, face_model, sequence.tracking.face)
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in avatar.parameters():
-            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-    return avatar
+    return moved(METHODS[method].avatar(settings, face_model, sequence.tracking.face), 0.1)
 
 
 def export(avatar: Avatar, path: Path) -> runtime.Avatar:

@@ -18,11 +18,9 @@ from mien.avatar.methods import DEFAULT_METHOD
 from mien.machine import exact
 from mien.rotation import skew
 from mien.training import trainer
-from mien.training.footage.frames import FrameOrder, training_frames
-from mien.training.footage.sequence import Targets
 from mutations.copies import Case, read_cases
 from plain_settings import plain_config, plain_run
-from toy_scene import toy_sequence
+from toy_scene import toy_data, toy_sequence
 
 ROOT = Path(__file__).parents[1]
 
@@ -90,8 +88,7 @@ def test_a_step_of_training_adds_up_by_itself():
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     settings = plain_run(steps=100, split="none", background="random", record_every=100)
     state = trainer.start([sequence], face_model, plain_config(DEFAULT_METHOD), settings, torch.zeros(()))
-    order = FrameOrder(training_frames([sequence], settings), settings.seed)
-    data = trainer.TrainingData(order, (Targets(sequence, 0),))
+    data = toy_data(sequence, settings)
     trainer.step(state, data, settings)
     with exact_guard():
         trainer.step(state, data, settings)

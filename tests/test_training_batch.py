@@ -31,14 +31,13 @@ from mien.render.rasterize import rasterize_each
 from mien.training import TrainSettings, train, trainer
 from mien.training.batch import TrainingData, coarse_steps, next_batch
 from mien.training.checkpoint import TrainingState, checkpoint_files
-from mien.training.footage.frames import FrameOrder, training_frames
 from mien.training.footage.sequence import Targets
 from mien.training.run import read_curves, read_training_summary
 from mien.training.trainer import start, step
 from plain_settings import plain_mono_gaussian_avatar, plain_run
 from refusals import refuses
 from test_methods import new_avatar
-from toy_scene import toy_camera, toy_face, toy_sequence
+from toy_scene import toy_camera, toy_data, toy_face, toy_sequence
 
 SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
@@ -51,8 +50,7 @@ def new_state(
 ) -> tuple[TrainingState, TrainingData]:
     face_model, sequence = toy_sequence(timesteps, 32)
     state = start([sequence], face_model, config, settings)
-    order = FrameOrder(training_frames([sequence], settings), settings.seed)
-    return state, TrainingData(order, (Targets(sequence, 0),))
+    return state, toy_data(sequence, settings)
 
 
 def pull_at(state: TrainingState, data: TrainingData, frame: int) -> torch.Tensor:

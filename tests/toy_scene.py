@@ -14,7 +14,10 @@ from mien.face import FaceModel, FaceParams
 from mien.gaussians import SH_C0
 from mien.runtime.posing import Face
 from mien.tracking.tracking import Tracking
-from mien.training.footage.sequence import Sequence
+from mien.training import TrainSettings
+from mien.training.footage.frames import FrameOrder, training_frames
+from mien.training.footage.sequence import Sequence, Targets
+from mien.training.trainer import TrainingData
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -124,6 +127,23 @@ def toy_sequence(timesteps: int = 10, size: int = 48) -> tuple[FaceModel, Sequen
     face_model = toy_face_model()
     capture, alpha = toy_capture(face_model, timesteps, size)
     return face_model, Sequence("toy", capture, toy_tracking(face_model, timesteps, size), alpha)
+
+
+def toy_data(sequence: Sequence, settings: TrainSettings, like: Tensor | None = None) -> TrainingData:
+    """Return the pictures of a sequence in the order of a training."""
+    order = FrameOrder(training_frames([sequence], settings), settings.seed)
+    targets = Targets(sequence, settings.resolution, like=torch.zeros(()) if like is None else like)
+    return TrainingData(order, (targets,))
+
+
+def moved(avatar: Avatar, size: float, but: str = " ") -> Avatar:
+    """Return the avatar, whose parameters get random changes of this size, but for those whose names end so."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, parameter in avatar.named_parameters():
+            if not name.endswith(but):
+                parameter.add_(size * torch.randn(parameter.shape, generator=generator))
+    return avatar
 
 
 def surface_of(avatar: Avatar) -> BoundSurface:
