@@ -19,7 +19,7 @@ from mien.disk.files import write_arrays
 from mien.disk.workspace import Workspace
 from mien.evaluation import cross
 from mien.face.loading import add_face_model
-from mien.lab.analysis.headgas import ABLATIONS
+from mien.lab.analysis.headgas_ablations import ABLATIONS
 from mien.media.video import write_video
 from mien.pipeline import track
 from mien.training.settings.splits import SEQUENCES

@@ -19,7 +19,7 @@ from mien.cli import COMMANDS, main
 from mien.commands.parsing import parse
 from mien.errors import UserError
 from mien.formats.page import write_page
-from mien.lab.analysis import gaussian_avatars, headgas
+from mien.lab.analysis import gaussian_avatars, headgas, headgas_ablations
 from toy_package import blocks
 from web_case import browse, drawn_head, served, violations
 
@@ -78,7 +78,9 @@ def test_the_papers_figures_are_those_that_analyses_show() -> None:
     sizes = [size[::-1] for size in (min(gaussian_avatars.TABLE_3), max(gaussian_avatars.TABLE_3))]
     assert numbers(28) == [*gaussian_avatars.TABLE_3.values(), *sizes[0], *sizes[1]]
     assert numbers(52) == [*headgas.SIZES.values(), *headgas.SIZES]
-    full, *others = (headgas.ABLATIONS[name][1:] for name in ("full", *(set(headgas.ABLATIONS) - {"full"})))
+    full, *others = (
+        headgas_ablations.ABLATIONS[name][1:] for name in ("full", *(set(headgas_ablations.ABLATIONS) - {"full"}))
+    )
     known = [[value for value in column if value is not None] for column in zip(*others, strict=True)]
     assert numbers(54) == [*full, *(most(column) for column in known for most in (min, max))]
 

@@ -213,20 +213,21 @@ def activation_table(changes: ExpressionChanges | FeatureDirections, face: Face)
     if known is None:
         known = _activations[changes] = face_activations(changes)
     out = np.empty(known.shape, np.float32)
-    parts = (face.expression, face.joints, face.head_rotation, face.head_translation)
-    _native.activation_table(known, *(_contiguous_row(part) for part in parts), out)
+    pose = _contiguous_row(face.head_rotation), _contiguous_row(face.head_translation)
+    _native.activation_table(known, _contiguous_row(face.expression), _contiguous_row(face.joints), *pose, out)
     return out
 
 
 def face_activations(changes: ExpressionChanges | FeatureDirections) -> _native.FaceActivations:
     """What turns a face into activations, in the form that the core takes."""
-    shares = head = None
     seen = np.empty((0, changes.directions.shape[1]), np.float32)
+    shares = head = None
     if isinstance(changes, ExpressionChanges):
         seen, shares, head = changes.seen, changes.shares, changes.head
     of_head = (None, None, None) if head is None else (head.rest, head.directions, head.seen)
-    arrays = (changes.rest, changes.directions, seen, shares, *of_head)
-    return _native.make_face_activations(*(None if one is None else _contiguous_row(one) for one in arrays))
+    own = _contiguous_row(changes.rest), _contiguous_row(changes.directions), _contiguous_row(seen)
+    shares, rest, directions, limits = (None if one is None else _contiguous_row(one) for one in (shares, *of_head))
+    return _native.make_face_activations(*own, shares, rest, directions, limits)
 
 
 _activations: "WeakKeyDictionary[ExpressionChanges | FeatureDirections, _native.FaceActivations]" = WeakKeyDictionary()

@@ -157,8 +157,10 @@ class _ChangedGaussians(torch.autograd.Function):
         moves_face = any(ctx.needs_input_grad[7:11])
         of_face = [torch.empty_like(tensor) if moves_face else None for tensor in arrays[2:6]]
         of_local = [torch.empty_like(tensor) for tensor in arrays[_LOCAL_AT]]
+        face, local = _posing_groups(arrays)
+        known = unpacked(scales, opacities, of_local[0], of_local[3])
         _native.ride_backward(
-            ctx.ride, data, topology, *_posing_groups(arrays), *unpacked(scales, opacities),
+            ctx.ride, data, topology, face, local, known[0], known[1],
             _native.PosedGaussians(*unpacked(*by_posed, by_head_pose)), _native.LocalGaussians(*unpacked(*of_local)),
             _native.FaceParameterGradients(*unpacked(*of_face)) if moves_face else None,
         )  # fmt: skip
@@ -168,7 +170,7 @@ class _ChangedGaussians(torch.autograd.Function):
         ]
         _native.ride_changes_backward(
             ctx.ride, topology, _change_arrays(arrays, changes), _native.ChangedArrays(*unpacked(*changed)),
-            changes.weights, *unpacked(of_local[0], of_local[3]), _native.ByChangedArrays(*unpacked(*by_changed)),
+            changes.weights, known[2], known[3], _native.ByChangedArrays(*unpacked(*by_changed)),
             _native.ChangeGradients(*unpacked(*of_changes)),
         )  # fmt: skip
         *of_bases, of_features, of_layer1, of_layer2 = of_changes
