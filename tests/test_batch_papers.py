@@ -98,8 +98,13 @@ def test_a_short_table_goes_on_where_it_stopped(tmp_path: Path, scene: Scene, mo
     assert ran[2][-2:] == ["--protocol", "insta"]
     assert batch(given, paper, out, *short) == 0
     assert (len(ran), table(out)) == (3, found), "all is done"
+    (out / "states/ann.json").unlink()  # as if it had been killed at its end
+    kept = {path: path.stat().st_mtime_ns for path in (out / "rows/ann").rglob("*.*") if path.is_file()}
+    assert batch(given, paper, out, *short) == 0
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept, "nothing is trained or scored again"
+    ran.clear()
     assert batch(given, paper, out, *short[:-1], "2") == 0
-    assert {Path(words[1]).name for words in ran[3:]} == {"bob"}
+    assert {Path(words[1]).name for words in ran} == {"bob"}
     assert " ± " in table(out)["The Method"][0]
     assert table(out)["The Method"][-1] == "run short: 4 of 4,000 steps, 2 of 3 subjects"
     tex = (out / "table.tex").read_text()
@@ -231,6 +236,7 @@ MISTAKES = {
     "Theirs": ("the method", "two rows have the name 'the method'"),
     '"30.10", "9"': ('"30.10"', "row 'Theirs' has 1 figure of the paper for 2 columns; give one for each"),
     "subjects = 2": ('subjects = "two"', "subjects 'two': give a whole number"),
+    'name = "Theirs"': ('steps = 3\nname = "Theirs"', "row 1: steps: there is no such setting"),
     "source": ("sauce", "sauce: a table has no such setting; did you mean source?"),
     "[[rows]]": ("[[lines]]", "has no rows"),
     'title = "A table"': ("layouts = { insts = {} }", "layouts.insts: give one of"),

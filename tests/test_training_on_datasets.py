@@ -23,8 +23,6 @@ from mien.batch.row import do_steps, run_row
 from mien.cli import main
 from mien.commands.batch_table import read_table
 from mien.datasets import overlay, pictures, sequences
-from mien.evaluation import evaluate
-from mien.evaluation.protocols import EvaluationSettings
 from mien.face import load_face_model
 from mien.face.cache import cache_folder
 from mien.face.loading import add_face_model
@@ -32,7 +30,7 @@ from mien.media.video import probe_video
 from mien.training import read_sequence, train
 from plain_settings import plain_config, plain_run
 from refusals import complaint
-from shared_things import MadeOnce, toy_workspace
+from shared_things import MadeOnce, rows_here, toy_workspace
 
 pytestmark = pytest.mark.unchecked
 TESTED = ("222200037", "222200046", "220700191", "222200039")
@@ -144,20 +142,18 @@ def test_mistakes_are_told_in_one_line(made_once: MadeOnce, tmp_path: Path, caps
 
 
 TASK = ("EXP-2-eyes", "SEN-10-port_strong_smokey")
-LAYOUTS: dict[str, tuple[Callable[[Path, Scene], Path], str, str, int]] = {
-    "vhap": (writers.write_vhap, "gaussian_avatars", "dataset", 7),
-    "insta": (partial(writers.write_insta, held_out=2), "headgas", "dataset", 2),
-    "imavatar": (writers.write_imavatar, "headgas", "dataset", 3),
-    "nersemble-benchmark": (partial(writers.write_benchmark, clips=TASK), "headgas", "nersemble-benchmark", 3),
-    "nerf-blendshape": (partial(writers.write_nerf_blendshape, scale=7.0, detected=True), "headgas", "tail", 1),
-    "nerface": (partial(writers.write_nerface, detected=True), "headgas", "dataset", 1),
+LAYOUTS: dict[str, tuple[Callable[[Path, Scene], Path], str, int]] = {
+    "vhap": (writers.write_vhap, "gaussian_avatars", 7),
+    "insta": (partial(writers.write_insta, held_out=2), "headgas", 2),
+    "imavatar": (writers.write_imavatar, "headgas", 3),
+    "nersemble-benchmark": (partial(writers.write_benchmark, clips=TASK), "headgas", 3),
+    "nerf-blendshape": (partial(writers.write_nerf_blendshape, scale=7.0, detected=True), "headgas", 1),
+    "nerface": (partial(writers.write_nerface, detected=True), "headgas", 1),
 }
-"""Writer, method and split of each layout that has a tracking, and how many pictures the split holds out.
+"""Writer and method of each layout that has a tracking, and how many pictures its split holds out.
 
 VHAP holds out one timestep seen by two cameras, and five seen by one. The last two have coefficients without a basis,
 which suffice for HeadGaS. NeRFBlendShape's own split needs more than 500 frames."""
-MODELS = {"nerf-blendshape": "coefficients-46", "nerface": "coefficients-76"}
-"""Face models of the layouts that do not have FLAME's parameters."""
 SMALL = {"gaussian_avatars": ("--steps", "30"), "headgas": ("--steps", "40", "--method.points", "400")}
 PLAIN = ("--training.unseen", "trained", "--training.inside", "free", "--training.mesh", "tracked")
 """Options that leave out what closes the sides that no camera filmed."""
@@ -167,29 +163,45 @@ def not_white(images: np.ndarray, mattes: np.ndarray, plate: np.ndarray | None =
     mattes[:] = 255 * (images < 250).any(-1)
 
 
+PAPER = """
+layouts.nersemble-benchmark = {{ split = "nersemble-benchmark" }}
+layouts.nerf-blendshape = {{ split = "tail", protocol = "", face-model = "coefficients-46" }}
+layouts.nerface = {{ face-model = "coefficients-76" }}
+options = {{ preset = "draft", "training.resolution" = 96 }}
+columns = {{ "PSNR" = "self_reenactment.psnr" }}
+rows = [{{ name = "Ours", method = "{method}", paper = ["31.4"] }}]
+"""
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_an_import_is_trained_on_and_scored_by_its_protocol(layout: str, tmp_path, monkeypatch) -> None:
+@pytest.mark.usefixtures("short_films")
+def test_a_layout_becomes_a_table_by_its_split_and_protocol(layout: str, tmp_path, monkeypatch) -> None:
     scene = drawn_person()
     monkeypatch.setattr(overlay, "LandmarkDetector", NoDetector)  # it finds no face in drawings this small
     shutil.copytree(cache_folder() / "face_models", tmp_path / "cache" / "face_models")
     monkeypatch.setenv("MIEN_CACHE", str(tmp_path / "cache"))
     add_face_model(replace(scene.model, name="flame"), Path("flame.npz"), "0")
-    write, method, split, held_out = LAYOUTS[layout]
-    given, root = write(tmp_path / "me", scene), tmp_path / "W"
+    write, method, held_out = LAYOUTS[layout]
+    write(tmp_path / "people/me", scene)
+    paper, out = tmp_path / "paper.toml", tmp_path / "out"
+    paper.write_text(PAPER.format(method=method))
     # NeRFace has no landmarks and no mattes, and the networks know no drawings this small.
     monkeypatch.setattr(sequences, "detected_landmarks", lambda images: writers.nerface_landmarks(scene, images))
     monkeypatch.setattr(pictures, "fill_mattes", not_white)
-    assert main(["import", str(given), "--out", str(root), "--face-model", MODELS.get(layout, "flame")]) == 0
-    line = ["train", str(root), "--method", method, "--split", split, "--preset", "draft"]
-    assert main([*line, "--training.resolution", "96", *SMALL[method], *PLAIN]) == 0
-    settings = EvaluationSettings(perceptual=False, video_frames=0, edges="filmed")
-    if layout != "nerf-blendshape":
-        settings = replace(settings, protocol=layout)
-    found = evaluate(root / "runs" / method, sorted((root / "sequences").iterdir()), settings)["protocols"]
+    rows_here(monkeypatch)
+    line = ["batch", str(tmp_path / "people"), "--paper", str(paper), "--out", str(out), *SMALL[method], *PLAIN]
+    assert main([*line, *(() if "nerf" in layout else ("--face-model", "flame"))]) == 0
+    (file,) = out.glob("rows/me/runs/*/metrics.json")
+    found = json.loads(file.read_text())["protocols"]
     assert sum(each["frames"] for each in found.values()) == held_out
     for name, each in found.items():
         assert each.get("dataset_protocol", layout) == layout
         assert each["psnr"] > each["baselines"]["mean_frame"]["psnr"] + 1, name
+    psnr = next(each["psnr"] for name, each in found.items() if name.startswith("self_reenactment"))
+    assert (
+        f"| Ours | {psnr:.2f} | 31.4 | run short: {SMALL[method][1]} of 4,000 steps; with "
+        in (out / "table.md").read_text()
+    )
 
 
 @pytest.mark.usefixtures("short_films")

@@ -80,8 +80,13 @@ def read_paper(path: Path) -> Paper:
     rows = content.pop("rows", None)
     if not isinstance(rows, list) or not rows:
         raise UserError(f"--paper {path}: has no rows; add a [[rows]] with a name and a method")
+    places = {f"--paper {path}: row {number}": row for number, row in enumerate(rows, 1)}
+    for where, given in ((f"--paper {path}", content), *places.items()):
+        made = {"run", "steps", "typed"} & {*given} if isinstance(given, dict) else ()
+        if made:
+            raise UserError(f"{where}: {min(made)}: there is no such setting; options such as steps go into options")
     paper = overlay(Paper(), content, f"--paper {path}", "a table")
-    lines = [overlay(Line(), row, f"--paper {path}: row {number}", "a row") for number, row in enumerate(rows, 1)]
+    lines = [overlay(Line(), row, where, "a row") for where, row in places.items()]
     for heading, figure in paper.columns.items():
         if figure not in FIGURES:
             raise UserError(no_such_setting(f"--paper {path}: column {heading!r} {figure!r}", "a result", (), FIGURES))

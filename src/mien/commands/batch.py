@@ -7,16 +7,18 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
 from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
-from mien.batch.paper import Paper
 from mien.batch.plan import Batch, Options, Row
 from mien.disk.config import Range
 from mien.errors import UserError
 from mien.machine.terminal import show
+
+if TYPE_CHECKING:
+    from mien.batch.paper import Paper
 
 _COUNT = Range(0, 100_000)
 
@@ -127,7 +129,7 @@ class Run:
         if failed:
             raise UserError(f"{failed} of {counted(len(rows), 'row')} failed; see `{status}`")
 
-    def _rows(self) -> tuple[list[Row], Paper | None]:
+    def _rows(self) -> "tuple[list[Row], Paper | None]":
         """The rows, and the table of the paper."""
         from mien.batch.paper import read_paper
         from mien.commands.batch_paper import subject_rows, with_runs

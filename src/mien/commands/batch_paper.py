@@ -10,7 +10,7 @@ from mien.batch.plan import ROWS, WORKSPACE, Row
 from mien.commands.batch_options import OF_SCORES, parsed, typed
 from mien.commands.batch_table import Entry, row_of
 from mien.commands.train_options import check_method
-from mien.datasets.registry import datasets, people_in, recognised
+from mien.datasets.registry import datasets, is_dataset, people_in, recognised
 from mien.errors import UserError
 from mien.training.settings.splits import NAMED_SPLIT, driving_sequences
 
@@ -38,7 +38,7 @@ class Person:
 
 def person_at(path: Path, where: str) -> Person:
     """The files of a subject: a dataset, or a folder of datasets of one layout."""
-    inside = [path / name for name in people_in(path)] or [path]
+    inside = [path] if is_dataset(path) else [path / name for name in people_in(path)] or [path]
     try:
         found = [recognised(each)[0] for each in inside]
     except UserError as error:
@@ -73,7 +73,7 @@ def with_runs(paper: Paper, path: Path, given: Words) -> Paper:
 def subject_rows(entries: Sequence[Entry], paper: Paper) -> list[Row]:
     """A row for each subject. Where subjects drive each other, rows that only make their sequences come first."""
     people, kinds, first = {each.name: _person(each) for each in entries}, set[str](), []
-    drivers = {name: drivers_of(people, name, paper) if paper.cross_reenactment else [] for name in people}
+    drivers = {each.name: _drivers(people, each, paper) for each in entries}
     for entry in entries if any(drivers.values()) else ():
         steps = making_steps(people[entry.name], paper, entry.options)
         steps = [[f"{ROWS}/{entry.name}" if word == WORKSPACE else word for word in step] for step in steps]
@@ -118,13 +118,13 @@ def making_steps(person: Person, paper: Paper, given: Words) -> list[list[str]]:
     ]
 
 
-def drivers_of(people: Mapping[str, Person], name: str, paper: Paper) -> list[str]:
-    """The workspaces of the other subjects that drive the avatar of the subject `name`."""
-    layout = people[name].layout
-    others = {other: one for other, one in people.items() if other != name and one.layout == layout}
-    if paper.layouts.get(layout, {}).get("split") == NAMED_SPLIT:
-        others = {other: one for other, one in others.items() if driving_sequences(one.sequences)}
-    return [f"{ROWS}/{other}" for other in others]
+def _drivers(people: Mapping[str, Person], entry: Entry, paper: Paper) -> list[str]:
+    """The workspaces of the other subjects that drive the subject's avatar."""
+    own = people[entry.name]
+    named = _options(own, paper, Line(), entry.options).get("split") == [NAMED_SPLIT]
+    others = (name for name, one in people.items() if one is not own and one.layout == own.layout)
+    driving = (name for name in others if not named or driving_sequences(people[name].sequences))
+    return [f"{ROWS}/{name}" for name in driving if paper.cross_reenactment]
 
 
 def _options(person: Person, paper: Paper, line: Line, given: Words) -> Words:
@@ -142,7 +142,7 @@ def _typed(command: str, options: Words) -> list[str]:
     """The options that are those of a command, as they are typed. `train` gets what no other command takes."""
 
     def takes(key: str) -> set[str]:
-        groups = {"capture": "capture", "tracking": "track", "scoring": "track", "memory-gb": "batch"}
+        groups = {"capture": "capture", "tracking": "track", "scoring": "track"}
         named = {"face-model": {"import", "track"}, "retrack": {"import"}} | dict.fromkeys(OF_SCORES, {"evaluate"})
         return named.get(key, {groups.get(key.partition(".")[0], "train")})
 

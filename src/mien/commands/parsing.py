@@ -26,7 +26,7 @@ _FIRST = {
     "create": ("out", "name", "preset", "method", "device", "view"),
     "render": ("out", "run", "set", "path", "motion", "yaw", "size", "background"),
     "drive": ("by", "out", "run", "neutral", "alone", "size"),
-    "batch": ("out", "on", "retry", "jobs", "shard"),
+    "batch": ("out", "paper", "subjects", "on", "retry", "jobs", "shard"),
 }
 """Commands with many options: the only ones that `--help` shows of them. `--help-all` shows all."""
 _COMMON = {

@@ -67,7 +67,12 @@ def people_in(path: Path) -> list[str]:
         inside = [each for each in listed(path) if each.is_dir()]
     except OSError:
         return []
-    return [each.name for each in inside[:_MAX_FOLDERS] if any(_told(one, each) is not None for one in datasets())]
+    return [each.name for each in inside[:_MAX_FOLDERS] if is_dataset(each)]
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a path has the files of a dataset."""
+    return any(_told(one, path) is not None for one in datasets())
 
 
 def _told(dataset: Dataset, path: Path) -> str | None:
