@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
-from mien.commands.evaluate import Protocol, check_weights, scoring_of
 from mien.commands.train_options import check_method, listed_methods
 from mien.disk.config import POSITIVE, Range
 from mien.disk.workspace import open_workspace
@@ -168,13 +167,9 @@ class Compare:
     means --steps."""
     steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps of each method. 0 means the preset's own number for each method."""
-    split: Literal["blocks", "tail", "dataset"] = "blocks"
-    """Held-out frames of workspaces: every fifth block of 10 frames (blocks), the last 20 % (tail), or what the authors
-    of an imported dataset hold out (dataset). Reference captures have their own."""
-    protocol: Protocol | None = None
-    """Score as the authors of an imported dataset do, as for `mien evaluate`; it needs --split dataset."""
-    lpips_weights: Path | None = None
-    """Torchvision's weights, to print exact LPIPS as well, as for `mien evaluate`."""
+    split: Literal["blocks", "tail"] = "blocks"
+    """Held-out frames of workspaces: every fifth block of 10 frames (blocks), or the last 20 % (tail). Reference
+    captures have their own. `mien batch --paper` compares methods by the split and protocol of a dataset."""
     device: DeviceName = "cpu"
     """Device to train on."""
     out: Path = Path("out/bench-compare")
@@ -200,21 +195,16 @@ class Compare:
             raise UserError(f"{twice}: two captures have this name; give one of them, or rename its folder")
         for folder in self.workspaces:
             open_workspace(folder)
-        if self.protocol is not None and self.split != "dataset":
-            raise UserError(f"--protocol {self.protocol}: scores what its authors hold out; give --split dataset too")
         check_device(self.device)
-        check_weights(self.lpips_weights)
         check_writable(self.out, folder=True)
 
     def run(self) -> None:
         """Train and score every method on every capture, then print the table."""
-        from mien.evaluation.protocols import EvaluationSettings
         from mien.pipeline.comparing import run_compare_stage
 
-        scored = EvaluationSettings(video_frames=0, **scoring_of(self.protocol, self.lpips_weights))
         run_compare_stage(
             self.out, [open_workspace(folder) for folder in self.workspaces], self.captures,
-            list(dict.fromkeys(self.methods)), minutes=self.minutes, steps=self.steps, split=self.split, scored=scored,
+            list(dict.fromkeys(self.methods)), minutes=self.minutes, steps=self.steps, split=self.split,
             device=self.device, as_json=self.as_json,
         )  # fmt: skip
 

@@ -32,7 +32,8 @@ from mien.training.trainer import train
 
 _FORMAT, _VERSION = "mien.bench_compare", 1
 _PRESET = PRESETS["standard"]
-Split = Literal["blocks", "tail", "dataset"]
+Split = Literal["blocks", "tail"]
+_SCORED = EvaluationSettings(video_frames=0)
 FIRST_TRIAL_STEPS, _MOST_FIRST_STEPS = 100, 400
 """Least and largest number of steps of the first trial. Between them, it uses each training frame once."""
 _TRIAL_SHARE = 0.1
@@ -64,7 +65,6 @@ def run_compare_stage(
     minutes: float,
     steps: int,
     split: Split,
-    scored: EvaluationSettings,
     device: DeviceName,
     as_json: bool,
 ) -> None:
@@ -72,12 +72,12 @@ def run_compare_stage(
 
     The captures are tracked workspaces, and reference captures, which are drawn, captured and tracked in OUT first.
     Each method trains on `device` for `minutes`, or else `steps`, or else as long as its preset says. `split` is that
-    of workspaces; reference captures have their own. `scored` says how runs are scored.
+    of workspaces; reference captures have their own.
     """
     budget = f"{minutes:g}min" if minutes else f"{steps}" if steps else "full"
     references = [reference_named(name) for name in captures]
     chosen = {"methods": list(methods), "budget": {"minutes": minutes, "steps": steps}, "split": split}
-    chosen |= {"protocol": scored.protocol, "device": device}
+    chosen |= {"device": device}
     rows: list[MethodRow] = []
     content: dict[str, Any] = {}
     with hold(out / "compare", remedy=f"{WAIT}, or choose another folder (--out DIR)"):
@@ -89,7 +89,7 @@ def run_compare_stage(
                 own = replace(subject.settings, steps=_PRESET.settings_of(method).steps, device=device)
                 trials = out / "trials" / subject.name / run
                 own = replace(own, steps=steps_for(subject, _PRESET.config(method), own, minutes, steps, trials))
-                rows.append(_row(subject, method, run, own, scored))
+                rows.append(_row(subject, method, run, own))
                 content = {"settings": chosen, "machine": asdict(measure_machine()), "rows": list(map(asdict, rows))}
                 content = json.loads(json.dumps(content))
                 write_json(out / "compare.json", _FORMAT, _VERSION, content)
@@ -114,11 +114,11 @@ def _of_reference(reference: ReferenceCapture, out: Path) -> Subject:
     return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 
 
-def _row(subject: Subject, method: str, run: str, settings: TrainSettings, scored: EvaluationSettings) -> MethodRow:
+def _row(subject: Subject, method: str, run: str, settings: TrainSettings) -> MethodRow:
     """Train and score a method on a capture, unless that is done."""
     workspace, run_dir = subject.workspace, subject.workspace.run_dir(run)
     run_training_stage(workspace, subject.sequences, run, _PRESET.config(method), settings)
-    metrics = run_evaluation_stage(workspace, run, scored, again=False)
+    metrics = run_evaluation_stage(workspace, run, _SCORED, again=False)
     summary, unseen = read_training_summary(run_dir), {}
     if subject.reference is not None and subject.drawn is not None:
         unseen = score_unseen_views(subject.reference, subject.drawn, workspace, run)

@@ -16,7 +16,6 @@ _QUALITY: tuple[tuple[str, str, int, bool], ...] = (
     ("psnr", "whole frame: PSNR", 2, True),
     ("ssim", "SSIM", 3, True),
     ("l1", "L1", 4, False),
-    ("lpips", "LPIPS", 3, False),
     ("unseen.psnr", "unseen views: PSNR", 2, True),
     ("unseen.perceptual", "ST-LPIPS", 3, False),
 )
@@ -52,7 +51,7 @@ class MethodRow:
     def figures(self, protocol: str) -> dict[str, float | None]:
         """Return every number of the table, by its dotted name. None if it was not computed."""
         entry = self.protocols[protocol]
-        found: dict[str, float | None] = {metric: entry.get(metric) for metric in ("psnr", "ssim", "l1", "lpips")}
+        found: dict[str, float | None] = {metric: entry.get(metric) for metric in ("psnr", "ssim", "l1")}
         for part in ("head", "eyes", "mouth"):
             for metric in ("psnr", "ssim", "perceptual"):
                 found[f"{part}.{metric}"] = entry.get(part, {}).get(metric)
