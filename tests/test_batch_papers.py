@@ -12,6 +12,7 @@ import pytest
 import dataset_writers as writers
 from dataset_cases import make_quick, tiny_scene
 from dataset_scene import Scene, scene_of
+from mien.batch import drive
 from mien.batch.paper import read_paper
 from mien.cli import main
 from mien.commands.batch_paper import with_runs
@@ -130,11 +131,18 @@ def test_faces_are_fitted_where_the_paper_fits_them(tmp_path: Path, scene: Scene
     assert found[-2] == "30.83, 27.47, 31.76"
 
 
+@pytest.mark.slow
 def test_subjects_drive_each_other_once_all_are_imported(tmp_path: Path, scene: Scene, monkeypatch, capsys) -> None:
     """GaussianAvatars' data: a subject is a folder of exports of VHAP. Only FREE drives others."""
     ran, given, out, paper = rows_here(monkeypatch), tmp_path / "people", tmp_path / "out", tmp_path / "paper.toml"
     monkeypatch.setattr(
         cross, "measure", lambda driven, name: dict.fromkeys(FIGURES, 0.25) | {"frames": 6, "driver": name}
+    )
+    batches, whole = [], drive.drive
+    monkeypatch.setattr(
+        drive,
+        "drive",
+        lambda batch, rows, *more: batches.append([row.name for row in rows]) or whole(batch, rows, *more),
     )
     paper.write_text((PAPERS / "gaussian_avatars.toml").read_text().replace('method = "point_avatar"\n', ""))
     names = [f"{subject}/{subject}_{name}" for subject in ("306", "074") for name in (*SEQUENCES, "FREE")]
@@ -143,6 +151,7 @@ def test_subjects_drive_each_other_once_all_are_imported(tmp_path: Path, scene: 
     told = complaint(capsys, "batch", given, "--paper", paper, "--out", out, *short, "--shard", "1/2")
     assert "subjects drive each other; leave --shard and --store out" in told
     assert batch(given, paper, out, *short) == 0
+    assert batches == [["074-made", "306-made"], ["074", "306"]], "imports end before other rows begin"
     before = ran[: [words[0] for words in ran].index("train")]
     assert {words[1] for words in before} == {str(given / name) for name in names}, (
         "all are imported before any training"

@@ -30,6 +30,7 @@ FOLDERS = (
 )  # fmt: skip
 """Names of NeRSemble's folders."""
 NAMED, BENCHMARK = TrainSettings(split="gaussian-avatars"), TrainSettings(split="nersemble-benchmark")
+OWN = TrainSettings(split="dataset")
 FRONTAL = "222200037"
 RECORDED = ("EMO-1-shout+laugh", "EXP-2-eyes", "FREE", "SEN-01-cramp_small_danger", "SEN-10-port_strong_smokey")
 TESTS = (RECORDED[0], "FREE", RECORDED[4])
@@ -95,6 +96,7 @@ def test_either_name_of_the_camera_is_held_out() -> None:
     ids["EXP-4"] = ("front",)
     words = r"EXP-4 has no camera 08 or 222200037, which it holds out \(there are front\)"
     refuses(words, fill_in, NAMED, given(SEQUENCES, cameras=ids))
+    refuses("the sequence EMO-1 has no split of its dataset", fill_in, OWN, given(["EMO-1"], cameras=("08",)))
     refuses("is not filled in", training_frames, [toy_sequence(6, 16)[1]], NAMED)
 
 
