@@ -87,8 +87,10 @@ void expression_change(const Array<const float>& basis, const In<-1, -1>& activa
 }  // namespace
 
 void bind_expression_change(nb::module_& module) {
-  nb::class_<mien::FaceActivations>(module, "FaceActivations", "What turns a face into activations of its triangles.")
-      .def_prop_ro("shape", [](const mien::FaceActivations& own) { return std::pair(own.rows(), own.width()); });
+  nb::class_<mien::FaceActivations>(module, "FaceActivations", "What turns a face into activations of its triangles.");
+  module.def(
+      "activation_shape", [](const mien::FaceActivations& face) { return std::pair(face.rows(), face.width()); },
+      "face"_a, "Returns the numbers of rows and of activations of a table.");
   module.def("make_face_activations", &make_face_activations, "rest"_a, "directions"_a, "seen"_a, "shares"_a.none(),
              "head_rest"_a.none(), "head_directions"_a.none(), "head_seen"_a.none(), "Copies the arrays.");
   module.def("activation_table", &activation_table, "face"_a, "expression"_a, "joints"_a, "rotation"_a, "translation"_a,

@@ -88,7 +88,7 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     rest = step_parts.REST
     assert len(found) == len(rows)
     assert found >= {
-        ("pose and draw", "rasterize_views"), ("pose and draw", "feature_network"), ("pose and draw", rest),
+        ("pose and draw", "rasterize_views"), ("pose and draw", "ride"), ("pose and draw", rest),
         ("losses of pictures", "photometric_loss"), ("perceptual loss", rest), ("backward", "rasterize_views_backward"),
         ("side views", "rasterize_mesh"), ("update", "adam_update"), ("update", "factored_update"),
         ("after update", "keep_on_surface"), ("after backward", "clear_rows"), ("other", rest),
@@ -96,7 +96,7 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert dict(vars(_native)) == before
     shown = step_parts.format_parts(rows)
     assert "a step, " in shown
-    assert shown.count("feature_network_backward") == 1
+    assert shown.count("ride_changes_backward") == 1
 
 
 @pytest.mark.parametrize(

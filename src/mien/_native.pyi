@@ -470,9 +470,10 @@ def bake_texture(
 def light_equations(surface: AlignSurface, sighting: SightingArrays, hessian: Tensor, right: Tensor) -> None: ...
 
 # native/bind_expression_change.cpp
-class FaceActivations:
-    shape: tuple[int, int]
-    """Of a table: triangles, or 1 if the face is one region, and activations."""
+class FaceActivations: ...
+
+def activation_shape(face: FaceActivations) -> tuple[int, int]:
+    """Returns the shape of a table: triangles, or 1 if the face is one region, and activations."""
 
 def make_face_activations(
     rest: Tensor,

@@ -293,8 +293,10 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "absolute_difference": lambda c: c.given("H W", "<256 H W:u1", 0.5, "=H W", "="),
     "activate_points": lambda c: [
         c.RawPoints("n 11", "n 3", "n 4", "n", "n 3"), 0.5, 0.1, c.ActivatedPoints("=n 3", "=n 4", "=n", "=n 1 3")],
+    "activation_shape": lambda c: [c.make_face_activations(*face_activations(c))],
     "activation_table": lambda c: [
-        own := c.make_face_activations(*face_activations(c)), *c.given("j", "3", "3", "3"), np.zeros(own.shape, F32)],
+        own := c.make_face_activations(*face_activations(c)), *c.given("j", "3", "3", "3"),
+        np.zeros(c.native.activation_shape(own), F32)],
     "adam_update": lambda c: [[
         Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01) for _ in range(c.size("a"))]],
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),

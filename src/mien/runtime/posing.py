@@ -212,7 +212,7 @@ def activation_table(changes: ExpressionChanges | FeatureDirections, face: Face)
     known = _activations.get(changes)
     if known is None:
         known = _activations[changes] = face_activations(changes)
-    out = np.empty(known.shape, np.float32)
+    out = np.empty(_native.activation_shape(known), np.float32)
     pose = _contiguous_row(face.head_rotation), _contiguous_row(face.head_translation)
     _native.activation_table(known, _contiguous_row(face.expression), _contiguous_row(face.joints), *pose, out)
     return out

@@ -104,7 +104,7 @@ class ExpressionActivations(nn.Module):
         if self._compiled is None or self._compiled[0] != versions:
             self._compiled = versions, buffers, face_activations(self.record())
         known = self._compiled[2]
-        table = torch.empty(known.shape)
+        table = torch.empty(_native.activation_shape(known))
         _native.activation_table(known, *unpacked(*parts, table))
         return table
 
