@@ -16,6 +16,7 @@ from mien.batch import drive
 from mien.batch.paper import read_paper
 from mien.cli import main
 from mien.commands.batch_paper import with_runs
+from mien.commands.batch_table import read_table
 from mien.disk.files import write_arrays
 from mien.disk.workspace import Workspace
 from mien.evaluation import cross
@@ -251,6 +252,23 @@ MISTAKES = {
     'title = "A table"': ("layouts = { insts = {} }", "layouts.insts: give one of"),
     "title = ": ("title ", "cannot be read as TOML"),
 }
+
+
+def test_files_that_a_table_needs_are_looked_at_before_any_work(tmp_path: Path, monkeypatch, capsys) -> None:
+    """A subject's name is that of a link, not of what it leads to."""
+    ran, people = rows_here(monkeypatch), tmp_path / "people"
+    people.mkdir()
+    (tmp_path / "clip.mp4").touch()
+    for name in ("ann", "ben"):
+        (people / f"{name}.mp4").symlink_to(tmp_path / "clip.mp4")
+    (tmp_path / "paper.toml").write_text(SMALL)
+    (tmp_path / "vgg.pth").write_bytes(b"not weights")
+    given = ("batch", people, "--out", tmp_path / "out", "--paper")
+    assert "nothere.toml: no such file; give a table" in complaint(capsys, *given, tmp_path / "nothere.toml")
+    weights = (tmp_path / "paper.toml", "--lpips-weights", tmp_path / "vgg.pth")
+    assert "vgg.pth: is not the file that torchvision published" in complaint(capsys, *given, *weights)
+    assert not ran
+    assert [row.name for row in read_table(people, [])] == ["ann", "ben"]
 
 
 @pytest.mark.parametrize("right", MISTAKES)

@@ -71,6 +71,8 @@ class Paper:
 
 def read_paper(path: Path) -> Paper:
     """Read a table, and check everything in it that needs no other file."""
+    if not path.exists():
+        raise UserError(f"--paper {path}: no such file; give a table as in examples/papers")
     try:
         content = tomllib.loads(read_bytes(path, 1 << 20).decode("utf-8"))
     except (OSError, ValueError) as error:

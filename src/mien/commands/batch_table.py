@@ -169,8 +169,9 @@ def _entry(folder: Path, entry: dict[str, Any], where: str, usual: Mapping[str, 
         there = ", ".join(map(repr, original.values()))
         raise UserError(f"{where}: has no video and no dataset; its columns are {there} (commas separate columns)")
     inputs = [_input(folder, word, where) for word in videos or dataset]
-    _check_twice([Path(word).stem for word in inputs], where, "two videos have the name {!r}; rename one of the files")
-    name = "".join(cells.get("name", [])) or Path(inputs[0]).stem
+    names = [Path(word).stem for word in videos or dataset]  # of links, not of what they lead to
+    _check_twice(names, where, "two videos have the name {!r}; rename one of the files")
+    name = "".join(cells.get("name", [])) or names[0]
     if not is_plain_name(name) or name.startswith((".", "-")):
         raise UserError(f"{where}: {name!r} cannot be the name of a folder; give another name")
     methods = cells.get("method", []) + cells.get("methods", [])
