@@ -127,7 +127,7 @@ def table_of(rows: Sequence[dict[str, Any]], paper: Paper) -> list[list[str]]:
 
 
 def _state(line: Line, own: Sequence[dict[str, Any]], paper: Paper) -> str:
-    """What our figures of a line are: a whole run, a short one with what it lacks, or none."""
+    """Say what our figures of a line are: a whole run, a short one with what it lacks, or none."""
     if not (line.method and own):
         return "not run" if line.method else "the paper's figures alone"
     steps = min(numbers(own, "steps"), default=0)

@@ -1,4 +1,4 @@
-"""What captures of a video and of several cameras share: the request, its key, and the folders of its work.
+"""Captures of a video and of several cameras share these parts: the request, its key, and the folders of its work.
 
 A capture that is finished is found by its key. Unfinished work is kept beside it, under the same key.
 """

@@ -75,7 +75,7 @@ def read_table(path: Path, for_all: Sequence[str] = ()) -> list[Row]:
 
 
 def read_entries(path: Path, usual: Mapping[str, Sequence[str]], paper: bool = False) -> list[Entry]:
-    """What the rows of a csv, a json, or a folder of videos say.
+    """Read the rows of a csv, a json, or a folder of videos.
 
     `usual` has options of all rows. For the table of a `paper`, folders of a folder are subjects as well, and a row has
     the options of any stage.

@@ -219,7 +219,7 @@ def activation_table(changes: ExpressionChanges | FeatureDirections, face: Face)
 
 
 def face_activations(changes: ExpressionChanges | FeatureDirections) -> _native.FaceActivations:
-    """What turns a face into activations, in the form that the core takes."""
+    """Return the activations' arrays in the form that the core takes."""
     seen = np.empty((0, changes.directions.shape[1]), np.float32)
     shares = head = None
     if isinstance(changes, ExpressionChanges):

@@ -15,7 +15,7 @@ DetectorChoice = Literal["auto", "mediapipe", "litert"]
 """The choices of a user. auto is mediapipe where it is installed, and otherwise litert."""
 Detector = Literal["mediapipe", "litert"]
 FoundBy = Literal["mediapipe", "litert", "other"]
-"""What found the landmarks of a capture. other: another program found the 68 points of 300-W."""
+"""The program that found the landmarks of a capture. other: another program found the 68 points of 300-W."""
 MODULE_OF: dict[Detector, str] = {"mediapipe": "mediapipe", "litert": "ai_edge_litert"}
 _NOISE = re.compile(
     rb"^(INFO: Created TensorFlow Lite|WARNING: All log messages before absl|[IW]\d{4} \d\d:\d\d:\d\d|[IW]0000 )"

@@ -114,7 +114,7 @@ def widened(context: Context, config: HeadGasConfig, run: Run) -> tuple[Run, dic
 
 
 def ablation_findings(steps: int, rows: list[dict[str, Any]]) -> list[str]:
-    """What the rows say about the paper's claims: the full method has the fewest Gaussians and the best PSNR."""
+    """Say how the rows agree with the paper's claims: the full method has the fewest Gaussians and the best PSNR."""
     few = min(rows, key=lambda row: row["gaussians"])
     findings = [
         f"After {steps:,} steps, {ABLATIONS[few['name']][0]} has the fewest Gaussians "
