@@ -91,16 +91,16 @@ template <typename T>
 struct PosedGaussians {
   static constexpr char kName[] = "PosedGaussians";
   static constexpr const char* kFields[] = {"means", "quats", "scales", "opacities", "head_pose"};
-  Array<T, nb::shape<1, -1, 3>> means;
-  Array<T, nb::shape<1, -1, 4>> quats;
-  Array<T, nb::shape<1, -1, 3>> scales;
+  Array<T, nb::shape<-1, 3>> means;
+  Array<T, nb::shape<-1, 4>> quats;
+  Array<T, nb::shape<-1, 3>> scales;
   Array<T, nb::shape<-1>> opacities;
-  std::optional<Array<T, nb::shape<1, 4, 4>>> head_pose;
+  std::optional<Array<T, nb::shape<4, 4>>> head_pose;
 
   PosedGaussians(const Group<PosedGaussians>& group, size_t count) {
     group.read(means, quats, scales, opacities, head_pose);
     require(
-        means.shape(1) == count && quats.shape(1) == count && scales.shape(1) == count && opacities.shape(0) == count,
+        means.shape(0) == count && quats.shape(0) == count && scales.shape(0) == count && opacities.shape(0) == count,
         "posed Gaussians and their gradients must have one row per Gaussian");
   }
 };
@@ -184,7 +184,7 @@ Ride forward(const mien::FaceModelData& model, const mien::RigTopology& topology
 
 // Fills the gradients of the face from those of its vertices and, in the head frame, from that of its pose.
 void face_backward(const mien::FaceModelData& model, const Ride& ride, const Rider& rider, const float* by_vertices,
-                   const std::optional<In<1, 4, 4>>& by_head_pose, const FaceParameterGradients& gradients) {
+                   const std::optional<In<4, 4>>& by_head_pose, const FaceParameterGradients& gradients) {
   const size_t floats = 3 * static_cast<size_t>(model.vertices);
   mien::Recycled<float> by_rest(floats + 3 * static_cast<size_t>(model.joints));
   float *rotation = gradients.head_rotation.data(), *translation = gradients.head_translation.data();
@@ -200,7 +200,7 @@ void face_backward(const mien::FaceModelData& model, const Ride& ride, const Rid
 
 void backward(const Ride& ride, const mien::FaceModelData& model, const mien::RigTopology& topology,
               const Group<FaceArrays>& face_group, const Group<LocalGaussians<const float>>& local_group,
-              const In<1, -1, 3>& scales, const In<-1>& opacities,
+              const In<-1, 3>& scales, const In<-1>& opacities,
               const Group<PosedGaussians<const float>>& by_posed_group,
               const Group<LocalGaussians<float>>& local_gradient_group,
               const std::optional<Group<FaceParameterGradients>>& face_gradient_group) {
@@ -211,7 +211,7 @@ void backward(const Ride& ride, const mien::FaceModelData& model, const mien::Ri
   const LocalGaussians<float> by_local(local_gradient_group, count);
   std::optional<FaceParameterGradients> by_face;
   if (face_gradient_group) by_face.emplace(*face_gradient_group, rider.face);
-  require(scales.shape(1) == count && opacities.shape(0) == count,
+  require(scales.shape(0) == count && opacities.shape(0) == count,
           "posed Gaussians and their gradients must have one row per Gaussian");
   const nb::gil_scoped_release release;
   std::optional<mien::Recycled<float>> by_vertices;

@@ -159,6 +159,18 @@ void absolute_difference(const Array<const float, nb::ndim<2>>& values, const Ar
       values.data(), target.data(), static_cast<int64_t>(values.size()), weight, gradient.data()));
 }
 
+void color_difference(const Array<const float, nb::shape<-1, -1, 3>>& image,
+                      const Array<const uint8_t, nb::shape<-1, -1, 3>>& target,
+                      const std::optional<Array<const uint8_t, nb::ndim<2>>>& counted, float weight, float free,
+                      const Array<float, nb::shape<-1, -1, 3>>& gradient, const Array<float, nb::shape<>>& loss) {
+  require(same_shape(image, target) && same_shape(image, gradient), "the pictures must be equally large");
+  require(!counted || has_shape(*counted, image.shape(0), image.shape(1)), "`counted` must have the picture's pixels");
+  const nb::gil_scoped_release release;
+  *loss.data() = static_cast<float>(
+      mien::color_difference({image.data(), target.data(), counted ? counted->data() : nullptr,
+                              static_cast<int64_t>(image.size() / 3), weight, free, gradient.data()}));
+}
+
 }  // namespace
 
 void bind_training(nb::module_& module) {
@@ -181,6 +193,9 @@ void bind_training(nb::module_& module) {
   module.def("absolute_difference", &absolute_difference, "values"_a, "target"_a, "weight"_a, "gradient"_a, "loss"_a,
              "Fills the weighted mean absolute difference of a picture and one of bytes, where 255 is 1, and its "
              "gradient.");
+  module.def("color_difference", &color_difference, "image"_a, "target"_a, "counted"_a.none(), "weight"_a, "free"_a,
+             "gradient"_a, "loss"_a,
+             "The same of colours: differences up to `free` cost nothing, and pixels that are not counted add 0.");
   module.def("box_of_nonzero", &box_of_nonzero, "values"_a.noconvert(),
              "Left, top, width and height of the box that holds all numbers other than 0.");
 }

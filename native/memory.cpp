@@ -7,6 +7,7 @@ namespace mien {
 namespace {
 
 constexpr size_t kMostBytes = size_t{256} << 20;  // most unused memory that is kept
+constexpr size_t kLeastBytes = size_t{1} << 20;   // smaller blocks come back from the allocator without fresh pages
 
 struct Block {
   void* memory;
@@ -27,7 +28,7 @@ Spare& spare() {
 }  // namespace
 
 void* take_memory(size_t bytes) {
-  {
+  if (bytes >= kLeastBytes) {
     Spare& kept = spare();
     const std::lock_guard<std::mutex> lock(kept.mutex);
     for (auto block = kept.blocks.rbegin(); block != kept.blocks.rend(); ++block) {
@@ -42,6 +43,7 @@ void* take_memory(size_t bytes) {
 }
 
 void give_memory(void* memory, size_t bytes) noexcept {
+  if (bytes < kLeastBytes) return free_aligned(memory);
   Spare& kept = spare();
   const std::lock_guard<std::mutex> lock(kept.mutex);
   try {

@@ -1,6 +1,7 @@
 #include "training.h"
 
 #include <algorithm>
+#include <cmath>
 #include <vector>
 
 #include "isa.h"
@@ -129,6 +130,31 @@ double absolute_difference(const float* values, const uint8_t* bytes, int64_t co
     const int64_t first = piece * kElements;
     parts[piece] = kernels.absolute_difference(values + first, bytes + first, share, gradient + first,
                                                std::min(kElements, count - first));
+  });
+  double total = 0;
+  for (int64_t piece = 0; piece < pieces; ++piece) total += parts[piece];
+  return static_cast<double>(share) * total;
+}
+
+double color_difference(const ColorDifference& task) {
+  const float share = task.weight / static_cast<float>(std::max<int64_t>(3 * task.pixels, 1));
+  const int64_t pieces = (task.pixels + kElements - 1) / kElements;
+  thread_local std::vector<double> sums;
+  sums.resize(pieces);
+  double* const parts = sums.data();
+  parallel_for(pieces, [&](int64_t piece) {
+    const int64_t end = std::min((piece + 1) * kElements, task.pixels);
+    double total = 0;
+    for (int64_t pixel = piece * kElements; pixel < end; ++pixel) {
+      const bool counts = !task.counted || task.counted[pixel];
+      for (int64_t i = 3 * pixel; i < 3 * pixel + 3; ++i) {
+        const float difference = task.image[i] - static_cast<float>(task.bytes[i]) * (1.0f / 255);
+        const float costs = counts ? std::max(std::abs(difference) - task.free, 0.0f) : 0.0f;
+        total += costs;
+        task.gradient[i] = costs > 0 ? std::copysign(share, difference) : 0.0f;
+      }
+    }
+    parts[piece] = total;
   });
   double total = 0;
   for (int64_t piece = 0; piece < pieces; ++piece) total += parts[piece];

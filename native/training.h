@@ -77,4 +77,15 @@ double mean_squared_difference(const float* image, const uint8_t* bytes, int64_t
 // `weight` times the mean of |values - bytes / 255|, and its gradient, which is written. Runs on the pool.
 double absolute_difference(const float* values, const uint8_t* bytes, int64_t count, float weight, float* gradient);
 
+// The same of colours [pixels, 3], where differences up to `free` cost nothing. Only `counted` pixels add to the mean,
+// which is over all of them; null stands for all. Runs on the pool.
+struct ColorDifference {
+  const float* image;
+  const uint8_t *bytes, *counted;
+  int64_t pixels;
+  float weight, free;
+  float* gradient;
+};
+double color_difference(const ColorDifference& task);
+
 }  // namespace mien

@@ -84,9 +84,10 @@ def _opaque_avatar(model: FaceModel, color: float) -> GaussianAvatars:
 def test_a_head_turns_about_its_own_axis_and_raised_expressions_stay_within_the_bounds(anny):
     face = _face(anny)
     face.head_rotation[:, 0] = 0.3
-    turned = turned_to_side(face, math.pi / 2)
+    turned, upright = turned_to_side(face, math.pi / 2)
     before, after = (matrix_from_axis_angle(one.head_rotation[0]) for one in (face, turned))
     torch.testing.assert_close(after[:, 1], before[:, 1])
+    torch.testing.assert_close(upright.float(), before[:, 1])
     torch.testing.assert_close(after[:, 2], before[:, 0], atol=1e-6, rtol=0)
     assert turned.head_translation.equal(face.head_translation)
     views, rest = _views(anny), _face(anny).expression

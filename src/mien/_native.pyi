@@ -154,6 +154,7 @@ def set_rasterize_isa(name: str) -> bool: ...
 
 # native/bind_memory.cpp
 def recycled(shape: Sequence[int]) -> torch.Tensor: ...
+def unpacked(*tensors: torch.Tensor | None) -> list[Any]: ...
 
 # native/bind_rig.cpp; faces, face_index: int64; b timesteps first in vertices, frames and what is in world space
 TRIANGLE_FRAME_FLOATS: int
@@ -371,6 +372,11 @@ def clear_rows(chosen: Tensor, arrays: list[Tensor]) -> None:
 def mean_squared_difference(image: Tensor, target: Tensor) -> float: ...
 def absolute_difference(values: Tensor, target: Tensor, weight: float, gradient: Tensor, loss: Tensor) -> None:
     """Fills `gradient` and `loss`. `target` is uint8."""
+
+def color_difference(
+    image: Tensor, target: Tensor, counted: Tensor | None, weight: float, free: float, gradient: Tensor, loss: Tensor
+) -> None:
+    """Fills `gradient` and `loss`. `target` and `counted` are uint8."""
 
 def box_of_nonzero(values: Tensor) -> tuple[int, int, int, int]: ...
 

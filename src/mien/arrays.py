@@ -1,31 +1,30 @@
 """Conversion of tensors for the native core."""
 
-import math
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.utils.dlpack import to_dlpack
 
 from mien import _native
 
 _Operation = TypeVar("_Operation", bound=Callable[..., Any])
-_MIN_RECYCLED = 1 << 18
-"""Smallest number of elements for which memory is recycled. Smaller blocks come back from the allocator without fresh
-pages."""
 
 
 def recycled(*shape: int) -> Tensor:
-    """An uninitialised float32 tensor on the CPU. A large one gets memory that was in use before.
+    """An uninitialised float32 tensor on the CPU, with at most four axes. A large one gets memory that was in use.
 
-    The kernel clears fresh pages, and at 2048x2048 that takes longer than drawing the picture.
+    The kernel clears fresh pages, and at 2048x2048 that takes longer than drawing the picture. PyTorch's own `empty`
+    takes twice as long for a small one.
     """
-    if math.prod(shape) < _MIN_RECYCLED:
-        return torch.empty(shape)
     return _native.recycled(shape)
+
+
+def recycled_like(tensor: Tensor) -> Tensor:
+    """`recycled` with the shape of a tensor."""
+    return _native.recycled(tensor.shape)
 
 
 def is_native(*tensors: Tensor) -> bool:
@@ -57,11 +56,25 @@ def native(reference: Callable[..., Any]) -> Callable[[_Operation], _Operation]:
 def unpacked(*tensors: Tensor | None) -> list[Any]:
     """CPU tensors in the form in which the core takes them, whether they need a gradient or not; None stays None.
 
-    The core would otherwise call `__dlpack__` of each tensor itself. That takes ten times as long, 2 us, and happens a
-    hundred times per training step. Use it only for functions with a single signature: each capsule can be consumed
-    only once, so a second overload could not read it.
+    The core would otherwise call `__dlpack__` of each tensor itself. That takes ten times as long, 2 us, records an
+    operator, and happens a hundred times per training step. Use it only for functions with a single signature: each
+    capsule can be consumed only once, so a second overload could not read it.
     """
-    return [None if tensor is None else to_dlpack(tensor) for tensor in tensors]
+    return _native.unpacked(*tensors)
+
+
+ONE = torch.ones(())
+"""What `own_derivative` gives to all losses on the CPU."""
+
+
+def own_derivative(loss: Float[Tensor, ""]) -> Tensor | None:
+    """The derivative of a loss by itself; None where PyTorch is to make it."""
+    return ONE if loss.dtype is torch.float32 and loss.device.type == "cpu" else None
+
+
+def times(gradient: Tensor, factor: Float[Tensor, ""]) -> Tensor:
+    """The gradient times a factor; itself if that is 1. It knows `ONE` without reading it."""
+    return gradient if factor is ONE or float(factor) == 1 else gradient * factor
 
 
 def clear_rows(chosen: Bool[Tensor, " n"], tensors: Sequence[Tensor]) -> None:

@@ -34,7 +34,8 @@ class Camera:
     @property
     def position(self) -> Float[Tensor, " 3"]:
         """The camera's centre in world space, in metres."""
-        return invert_rigid(self.viewmat)[:3, 3]
+        x, y, z = (self.viewmat[:3, :3] * self.viewmat[:3, 3:]).unbind()
+        return -((x + y) + z)
 
     def to(self, like: Tensor) -> "Camera":
         """This camera with the dtype and device of `like`."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import recycled_like, unpacked
 
 # Below this squared angle (radians), the closed forms lose digits and their Taylor series take over.
 _SMALL_ANGLE_SQUARED = 1e-8
@@ -126,7 +126,7 @@ class _ComposeRigid(torch.autograd.Function):
         first, second = first.contiguous(), second.contiguous()
         ctx.save_for_backward(first, second)
         if first.dtype == torch.float32 and first.device.type == "cpu":
-            out = torch.empty_like(first)
+            out = recycled_like(first)
             _native.compose_rigid(*unpacked(first, second, out))
             return out
         one, two, three, four = (first[:, :, None] * second).unbind(1)
@@ -138,7 +138,7 @@ class _ComposeRigid(torch.autograd.Function):
         first, second = ctx.saved_tensors
         of_first, of_second = ctx.needs_input_grad
         if first.dtype == torch.float32 and first.device.type == "cpu":
-            by_first, by_second = torch.empty_like(first), torch.empty_like(second)
+            by_first, by_second = recycled_like(first), recycled_like(second)
             _native.compose_rigid_backward(*unpacked(first, second, gradient.contiguous(), by_first, by_second))
         else:
             by_first, by_second = gradient @ second.T, first.T @ gradient

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 Rng = np.random.Generator
 Arguments = list[Any]
@@ -177,7 +178,7 @@ def face_activations(c: Call) -> Arguments:
 def ride(c: Call) -> Arguments:
     topology = c.make_rig_topology(c.size("v"), "<v t 3", "<t n")
     face = c.FaceArrays("v 3", "j+1 3", "1 e", "1 j 3", "1 3", "1 3")
-    posed = c.PosedGaussians("=1 n 3", "=1 n 4", "=1 n 3", "=n", "=1 4 4")
+    posed = c.PosedGaussians("=n 3", "=n 4", "=n 3", "=n", "=4 4")
     local = c.LocalGaussians("n 3", "n 4", "n 3", "n")
     model, changed = c.make_face_model(*make_face_model(c)), c.maybe(changes(c))
     return [model, topology, c.flag(), face, local, posed, *(changed or [])]
@@ -207,7 +208,7 @@ def ride_changes_backward(c: Call) -> Arguments:
 def ride_backward(c: Call) -> Arguments:
     model, topology, in_head, face, local, posed = ride(c)[:6]
     own = c.native.ride(model, topology, in_head, face, local, posed)
-    by_posed = c.PosedGaussians("1 n 3", "1 n 4", "1 n 3", "n", "1 4 4")
+    by_posed = c.PosedGaussians("n 3", "n 4", "n 3", "n", "4 4")
     by_local = c.LocalGaussians("=n 3", "=n 4", "=n 3", "=n")
     moved = c.maybe(c.FaceParameterGradients("=1 e", "=1 j 3", "=1 3", "=1 3"), 0.7)
     return [own, model, topology, face, local, posed.scales, posed.opacities, by_posed, by_local, moved]
@@ -311,6 +312,8 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "clear_rows": lambda c: [c.array("<2 n:u1"), c.given("n", "n 3", "n 2 4")],
     "compose_rigid": lambda c: c.given("4 4", "4 4", "=4 4"),
     "compose_rigid_backward": lambda c: c.given("4 4", "4 4", "4 4", "=4 4", "=4 4"),
+    "color_difference": lambda c: c.given(
+        "H W 3", "<256 H W 3:u1", "?<2 H W:u1", 0.5, 0.1, "=H W 3", "="),
     "composite": lambda c: c.given("<256 H W 3:u1", "<256 H W:u1", [1, 2, 255], c.box(), "=H W 3:u1"),
     "expression_change": lambda c: c.given("n 3? r", "a r", "?<a n", "=n 3?"),
     "factored_adam_update": lambda c: factored(c, "n k f", "+n k f", steps(c)),
@@ -358,6 +361,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "thread_count": lambda c: [],
     "triangle_penalties": lambda c: c.given(
         (1.0, 0.6), (0.01, 1.0), "n 3", "n 3", "<3 n:i4", "=n 3", "=n 3", "=", "="),
+    "unpacked": lambda c: [torch.zeros(c.size("n"), 3), None],
 }  # fmt: skip
 """Name of a native function -> the parts that make the arguments of a valid call."""
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import recycled, unpacked
+from mien.arrays import recycled, recycled_like, unpacked
 from mien.camera import Camera
 from mien.gaussians import Gaussians, Rendering
 from mien.render.validation import TooManyPairsError, check_finite
@@ -86,23 +86,22 @@ class _Rasterize(torch.autograd.Function):
             raise _NotFiniteError(ctx.frames.index(None))
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[2::3])
-        ctx.save_for_backward(*kept, *(output for output in outputs if output.is_floating_point()))
+        # PyTorch would make a tensor of each that it saves. A picture would keep itself, but for its history.
+        ctx.kept, ctx.pictures = kept, [output.data for output in outputs if output.is_floating_point()]
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        saved = ctx.saved_tensors
-        pictures = saved[5 * len(ctx.frames) :]
         views, tasks = [], []
         for index, frame in enumerate(ctx.frames):
-            own = saved[5 * index : 5 * index + 5]
-            image, alpha = pictures[2 * index : 2 * index + 2]
+            own = ctx.kept[5 * index : 5 * index + 5]
+            image, alpha = ctx.pictures[2 * index : 2 * index + 2]
             grad_image, grad_alpha, _ = gradients[3 * index : 3 * index + 3]
             grad_image = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
             grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-            found = [torch.empty_like(t) for t in own]
-            of_view = [torch.empty(len(own[0]), 2), torch.empty(4, 4), torch.empty(3, 3)]
+            found = [recycled_like(t) for t in own]
+            of_view = [recycled(len(own[0]), 2), recycled(4, 4), recycled(3, 3)]
             known = unpacked(image, alpha, grad_image, grad_alpha, *own, *found, *of_view)
             gaussians, of_gaussians = _native.GaussianArrays(*known[4:9]), _native.GaussianArrays(*known[9:14])
             shown = known[0], known[1], known[2], known[3]  # image, alpha and their gradients

@@ -1,6 +1,7 @@
 """The neck cut: where the body is cut off below the head, as one surface in space that all cameras see alike."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -64,10 +65,10 @@ def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Ten
 
     The plane is parallel to the one that fits the base of the neck best (total least squares).
     """
-    points, ring = (vertices[indices].double().numpy() for indices in (parts.base, parts.middle))
+    points, ring = (vertices.numpy()[indices.numpy()].astype(float) for indices in (parts.base, parts.middle))
     center = points.mean(0)
     normal = np.linalg.eigh((points - center).T @ (points - center))[1][:, 0]
-    normal = normal if normal @ up.double().numpy() > 0 else -normal
+    normal = normal if normal @ up.numpy() > 0 else -normal
     offsets = ring - ring.mean(0)
     flat = offsets - np.outer(offsets @ normal, normal)
     first = np.linalg.eigh(flat.T @ flat)[1][:, 2]
@@ -75,6 +76,19 @@ def fit_neck_cut(parts: NeckParts, vertices: Float[Tensor, "v 3"], up: Float[Ten
     radii = np.maximum(np.abs(offsets @ axes[:2].T).max(0), 1e-3)
     middle = ring.mean(0)
     return NeckCut(middle - (1 - _RAISED) * normal * ((middle - center) @ normal), axes, radii)
+
+
+class _Rays(NamedTuple):
+    """The rays of a camera's pixels in the frame of a cut."""
+
+    start: Float[np.ndarray, " 3"]
+    """The camera's centre."""
+    turned: Float[np.ndarray, "3 3"]
+    """From pixels to directions of depth 1 along the camera's axis."""
+    width: int
+    """Number of pixels in a row."""
+    focal: np.float32
+    """Focal length in pixels."""
 
 
 def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:
@@ -85,19 +99,19 @@ def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:
     because the temporary arrays of a whole picture are many times as large as the picture.
     """
     bands = (range(row, min(row + _BAND, camera.height)) for row in range(0, camera.height, _BAND))
-    return np.concatenate([_above_in_rows(cut, camera, band) for band in bands])
-
-
-def _above_in_rows(cut: NeckCut, camera: Camera, rows: range) -> Float[np.ndarray, "r w"]:
-    to_world = camera.viewmat[:3, :3].double().numpy().T
-    eye = camera.position.double().numpy()
-    inverse = to_world @ np.linalg.inv(camera.K.double().numpy())
+    K, eye = (tensor.numpy().astype(float) for tensor in (camera.K, camera.position))
     start = ((eye - cut.origin) @ cut.axes.T).astype(np.float32)
-    turned = cut.axes @ inverse
-    x = np.arange(camera.width, dtype=np.float32)[None] + 0.5
+    turned = cut.axes @ (camera.viewmat.numpy()[:3, :3].astype(float).T @ np.linalg.inv(K))
+    rays = _Rays(start, turned, camera.width, np.float32(K[1, 1]))
+    return np.concatenate([_above_in_rows(cut, rays, band) for band in bands])
+
+
+def _above_in_rows(cut: NeckCut, rays: _Rays, rows: range) -> Float[np.ndarray, "r w"]:
+    start = rays.start
+    x = np.arange(rays.width, dtype=np.float32)[None] + 0.5
     y = np.asarray(rows, dtype=np.float32)[:, None] + 0.5
     # Rays in the cylinder's frame, of depth 1 along the camera's axis, scaled so that the ellipse is a unit circle.
-    dx, dy, dz = ((row[0] * x + row[1] * y + row[2]).astype(np.float32) for row in turned)
+    dx, dy, dz = ((row[0] * x + row[1] * y + row[2]).astype(np.float32) for row in rays.turned)
     px, py = start[:2] / cut.radii
     dx, dy = dx / np.float32(cut.radii[0]), dy / np.float32(cut.radii[1])
     a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
@@ -107,6 +121,6 @@ def _above_in_rows(cut: NeckCut, camera: Camera, rows: range) -> Float[np.ndarra
     depth = nearest - np.sqrt(np.maximum(1 - miss, 0) / a)
     height = start[2] + depth * dz
     radius = float(np.sqrt(cut.radii[0] * cut.radii[1]))
-    pixel = np.maximum(depth, np.float32(1e-6)) / np.float32(camera.K[1, 1])
+    pixel = np.maximum(depth, np.float32(1e-6)) / rays.focal
     beside = radius * (_BESIDE - np.sqrt(miss)) + _SLOPE * height
     return (np.clip(height / pixel + 0.5, 0, 1) * np.clip(beside / pixel + 0.5, 0, 1)).astype(np.float32)

@@ -137,10 +137,10 @@ def factored_update(update: FactoredUpdate) -> None:
     tensor of a step. Only numbers below 1.2e-38 differ: they become 0, because running means that fade would be slow.
     """
     values, terms, moments, rate = update
-    terms = [FactoredTerm(rows, torch.atleast_2d(columns.detach()), places) for rows, columns, places in terms]
+    terms = [FactoredTerm(rows, torch.atleast_2d(columns.data), places) for rows, columns, places in terms]
     factored = isinstance(moments, FactoredMoments)
     state = (moments.second, moments.weights) if factored else (moments.first, moments.second, moments.step)
-    arrays = (values.detach(), *state)
+    arrays = (values.data, *state)
     if _fit_core((*arrays, *(tensor for term in terms for tensor in (term.rows, term.columns)))):
         native_values, *native_state = unpacked(*arrays)
         factors = (list(unpacked(*side)) for side in zip(*terms, strict=True))

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from mien import _native
-from mien.arrays import is_native, native, recycled, unpacked
+from mien.arrays import is_native, native, recycled, recycled_like, times, unpacked
 from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.camera import Box
 from mien.gaussians import Rendering
@@ -106,19 +106,18 @@ class _PhotometricLoss(torch.autograd.Function):
     ) -> Tensor:  # fmt: skip
         gradient = recycled(*image.shape) if ctx.needs_input_grad[0] else None
         drawn = None if drawn is None else drawn.contiguous()
-        loss = torch.empty(())
+        loss = recycled()
         pictures = unpacked(image.contiguous(), target.contiguous(), drawn, gradient, loss)
         _native.photometric_loss(box, weights, *pictures)
         for part in parts:
             loss += _add_part(part, image, target, weights, part_weight, gradient)
-        ctx.save_for_backward(gradient)
+        ctx.gradient = gradient
         return loss
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = ctx.saved_tensors
-        return gradient if float(grad_loss) == 1 else gradient * grad_loss, *[None] * 6
+        return times(ctx.gradient, grad_loss), *[None] * 6
 
 
 def _add_part(
@@ -132,7 +131,7 @@ def _add_part(
         return loss
     rows, columns = _slices(part)
     cut = image[rows, columns].contiguous()
-    own = None if gradient is None else torch.empty_like(cut)
+    own = None if gradient is None else recycled_like(cut)
     share = part_weight * cut.numel() / image.numel()
     pictures = unpacked(cut, target[rows, columns].contiguous(), None, own, loss)
     _native.photometric_loss((0, 0, width, height), (weights[0] * share, weights[1] * share), *pictures)
@@ -199,17 +198,63 @@ class _AlphaLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Tensor:
-        gradient, loss = recycled(*alpha.shape), torch.empty(())
+        gradient, loss = recycled(*alpha.shape), recycled()
         values, target, *filled = unpacked(alpha.contiguous(), matte.contiguous(), gradient, loss)
         _native.absolute_difference(values, target, weight, *filled)
-        ctx.save_for_backward(gradient)
+        ctx.gradient = gradient
         return loss
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = ctx.saved_tensors
-        return gradient if float(grad_loss) == 1 else gradient * grad_loss, None, None
+        return times(ctx.gradient, grad_loss), None, None
+
+
+def color_loss_reference(
+    image: Float[Tensor, "h w 3"],
+    picture: UInt8[Tensor, "h w 3"],
+    weight: float,
+    free: float = 0.0,
+    counted: Bool[Tensor, "h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """`color_loss` in plain PyTorch, for any dtype and device."""
+    costs = ((image - picture.to(image) / 255).abs() - free).clamp_min(0)
+    return weight * (costs if counted is None else costs * counted.to(image)[..., None]).mean()
+
+
+@native(color_loss_reference)
+def color_loss(
+    image: Float[Tensor, "h w 3"],
+    picture: UInt8[Tensor, "h w 3"],
+    weight: float,
+    free: float = 0.0,
+    counted: Bool[Tensor, "h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """`weight` times the mean absolute difference of colours (0..1) from a picture (0..255), less what is free.
+
+    Pixels that are not `counted` add 0 to the mean. Native for float32 on a CPU.
+    """
+    return _ColorLoss.apply(image, picture, weight, free, counted)  # pyright: ignore[reportReturnType]
+
+
+class _ColorLoss(torch.autograd.Function):
+    """One native pass computes value and gradient; `backward` only scales the gradient."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, picture: Tensor, weight: float, free: float, counted: Tensor | None
+    ) -> Tensor:
+        gradient, loss = recycled_like(image), recycled()
+        known = None if counted is None else counted.contiguous().view(torch.uint8)
+        own, target, chosen, *filled = unpacked(image.contiguous(), picture.contiguous(), known, gradient, loss)
+        _native.color_difference(own, target, chosen, weight, free, *filled)
+        ctx.gradient = gradient
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
+        return times(ctx.gradient, grad_loss), None, None, None, None
 
 
 @dataclass(frozen=True, eq=False)

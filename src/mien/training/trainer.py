@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien.arrays import own_derivative
 from mien.avatar.avatar import Avatar, Posed, move_avatar
 from mien.avatar.baking import measure_filmed
 from mien.avatar.density import DensityControl, GradientDensity
@@ -313,7 +314,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     losses |= compare_features(state, batch, shown)
     if head is not None:
         losses |= head.losses(progress)
-    torch.autograd.backward(list(losses.values()))
+    torch.autograd.backward(list(losses.values()), [own_derivative(loss) for loss in losses.values()])
     if head is not None:
         head.after_backward(progress, renderings)
 
@@ -373,7 +374,7 @@ def _after_update(
 
 
 def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: float, step_ms: float) -> str:
-    entry = {name: float(value.detach()) for name, value in losses.items()}
+    entry = {name: float(value.data) for name, value in losses.items()}
     rare = [] if state.head is None else [*state.head.rare_losses]
     rare += ["perceptual"] if state.avatar.config.photometric.perceptual.weight > 0 else []
     for name in rare:

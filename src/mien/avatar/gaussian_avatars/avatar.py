@@ -128,7 +128,8 @@ class GaussianAvatars(Avatar):
             thresholds=(1.0, config.scale_threshold),
             weights=(config.position_weight, 1.0),
         )
-        changes = {name: posed.aux[name].mean() for name in PENALTIES if name in posed.aux}
+        found = {name: posed.aux[name] for name in PENALTIES if name in posed.aux}
+        changes = {name: own.mean() if own.ndim else own for name, own in found.items()}
         return {"position": position, "scale": scale, **changes}
 
     def parameter_groups(self) -> list[ParameterGroup]:

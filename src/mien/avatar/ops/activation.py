@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import native, unpacked
+from mien.arrays import native, recycled_like, unpacked
 
 
 @native(torch.sigmoid)
@@ -21,7 +21,7 @@ class _Sigmoid(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
         values = values.contiguous()
-        out = torch.empty_like(values)
+        out = recycled_like(values)
         _native.sigmoid(*unpacked(values, out))
         ctx.save_for_backward(out)
         return out
@@ -30,6 +30,6 @@ class _Sigmoid(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (out,) = ctx.saved_tensors
-        result = torch.empty_like(out)
+        result = recycled_like(out)
         _native.sigmoid_backward(*unpacked(out, gradient.contiguous(), result))
         return result

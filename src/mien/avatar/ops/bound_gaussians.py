@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import unpacked
+from mien.arrays import recycled, recycled_like, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
@@ -33,8 +33,8 @@ def pose_bound_gaussians(
     """The posed Gaussians of a store, or of such tensors by name.
 
     The tensors are `face_index`, `means, quats, log_scales` in triangle units, and `opacity_logits`. The Gaussians are
-    in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per timestep.
-    Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training, takes one
+    in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per timestep,
+    and no batch axis for a single one. Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training, takes one
     native call forward and one backward.
     """
     prepared = prepare_posing(face_model, face, store)
@@ -74,7 +74,8 @@ def pose_bound_gaussians_reference(
     vertices = face_model.head_vertices(face) if in_head else face_model(face)
     means, quats, log_scales, opacity_logits = (store[name] for name in LOCAL)
     bound = bind_to_world(vertices, face_model.faces, store["face_index"], means, quats, log_scales)
-    return Gaussians(*bound, sigmoid(opacity_logits), sh, head_poses(face) if in_head else None)
+    posed = Gaussians(*bound, sigmoid(opacity_logits), sh, head_poses(face) if in_head else None)
+    return posed.timestep(0) if len(face) == 1 else posed
 
 
 class _BoundGaussians(torch.autograd.Function):
@@ -82,8 +83,8 @@ class _BoundGaussians(torch.autograd.Function):
     def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
         arrays = [tensor.contiguous() for tensor in inputs]
         count = len(arrays[-1])
-        means, quats, scales = (torch.empty(1, count, width) for width in (3, 4, 3))
-        opacities, head_pose = torch.empty(count), torch.empty(1, 4, 4)
+        means, quats, scales = (recycled(count, width) for width in (3, 4, 3))
+        opacities, head_pose = recycled(count), recycled(4, 4)
         known = unpacked(*arrays, means, quats, scales, opacities, head_pose)
         face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:10])
         posed = _native.PosedGaussians(*known[10:])
@@ -97,8 +98,8 @@ class _BoundGaussians(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *saved, scales, opacities = ctx.saved_tensors
         moves_face = any(ctx.needs_input_grad[5:9])
-        of_face = [torch.empty_like(tensor) if moves_face else None for tensor in saved[2:6]]
-        of_gaussians = [torch.empty_like(tensor) for tensor in saved[6:]]
+        of_face = [recycled_like(tensor) if moves_face else None for tensor in saved[2:6]]
+        of_gaussians = [recycled_like(tensor) for tensor in saved[6:]]
         head_pose = () if ctx.in_head else (None,)
         by_posed = (*(gradient.contiguous() for gradient in gradients), *head_pose)
         known = unpacked(*saved, *by_posed, *of_gaussians, scales, opacities)

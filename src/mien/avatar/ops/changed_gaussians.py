@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.adam import FactoredGradient, FactoredTerm
-from mien.arrays import recycled, unpacked
+from mien.arrays import recycled, recycled_like, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.bound_gaussians import LOCAL, pose_bound_gaussians, prepare_posing
 from mien.avatar.ops.feature_network import Layers, feature_network
@@ -47,7 +47,7 @@ class Changes:
 def pose_changed_gaussians(
     face_model: FaceModel, face: FaceParams, store: Tensors, sh: Float[Tensor, "n k 3"], in_head: bool, changes: Changes
 ) -> tuple[Gaussians, dict[str, Tensor]]:
-    """The posed Gaussians of one timestep, and by name their changes and the weighted mean squares of the changes.
+    """The posed Gaussians of one timestep without a batch axis, and by name changes and their weighted mean squares.
 
     Changes are added up before they join a value, as `mien.runtime` does, which gives the same bytes. Differentiable
     in the store, the layers and `face`; one native call forward and two backward for float32 on a CPU.
@@ -124,10 +124,10 @@ class _ChangedGaussians(torch.autograd.Function):
         sh, bases, neutral = arrays[_SH], arrays[_BASES_AT], arrays[14]
         assert sh is not None
         count = len(sh)
-        posed = [*(torch.empty(1, count, width) for width in (3, 4, 3)), torch.empty(count), torch.empty(1, 4, 4)]
-        found = [None if basis is None else torch.empty(basis.shape[:-1]) for basis in bases]
-        found += [None, None] if neutral is None else [torch.empty(count, 3), torch.empty(count)]
-        changed = [torch.empty_like(sh), *found, torch.empty(()), torch.empty(())]
+        posed = [*(recycled(count, width) for width in (3, 4, 3)), recycled(count), recycled(4, 4)]
+        found = [None if basis is None else recycled(*basis.shape[:-1]) for basis in bases]
+        found += [None, None] if neutral is None else [recycled(count, 3), recycled(count)]
+        changed = [recycled_like(sh), *found, recycled(), recycled()]
         ctx.ride = _native.ride(
             data, topology, in_head, *_posing_groups(arrays), _native.PosedGaussians(*unpacked(*posed)),
             _change_arrays(arrays, changes), _native.ChangedArrays(*unpacked(*changed)), changes.weights,
@@ -135,7 +135,9 @@ class _ChangedGaussians(torch.autograd.Function):
         ctx.fixed, ctx.rows = (data, topology, in_head, changes), rows
         ctx.neutral = inputs[14] if neutral is not None and neutral.is_leaf else None
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*arrays, posed[2], posed[3], *changed)
+        # PyTorch would make a tensor of each that it saves. Those that are returned are kept without their history,
+        # since they would otherwise keep themselves.
+        ctx.arrays, ctx.found = arrays, [None if one is None else one.data for one in (*posed[2:4], *changed)]
         linear = changed[-2] if any(basis is not None for basis in bases) else None
         return (
             *posed[:4],
@@ -149,14 +151,14 @@ class _ChangedGaussians(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         data, topology, in_head, changes = ctx.fixed
-        arrays, scales, opacities, changed = ctx.saved_tensors[:18], *ctx.saved_tensors[18:20], ctx.saved_tensors[20:]
-        shapes = [(1, len(opacities), width) for width in (3, 4, 3)] + [opacities.shape]
+        arrays, (scales, opacities, *changed) = ctx.arrays, ctx.found
+        shapes = [(len(opacities), width) for width in (3, 4, 3)] + [opacities.shape]
         *by_posed, by_head_pose = (None if one is None else one.contiguous() for one in gradients[:5])
         by_posed = [torch.zeros(shape) if one is None else one for one, shape in zip(by_posed, shapes, strict=True)]
         by_changed = [None if one is None else one.contiguous() for one in gradients[5:]]
         moves_face = any(ctx.needs_input_grad[7:11])
-        of_face = [torch.empty_like(tensor) if moves_face else None for tensor in arrays[2:6]]
-        of_local = [torch.empty_like(tensor) for tensor in arrays[_LOCAL_AT]]
+        of_face = [recycled_like(tensor) if moves_face else None for tensor in arrays[2:6]]
+        of_local = [recycled_like(tensor) for tensor in arrays[_LOCAL_AT]]
         face, local = _posing_groups(arrays)
         known = unpacked(scales, opacities, of_local[0], of_local[3])
         _native.ride_backward(
@@ -179,7 +181,7 @@ class _ChangedGaussians(torch.autograd.Function):
                 # It may share the memory of an earlier term, and autograd adds to it in place.
                 ctx.neutral.grad = ctx.neutral.grad.clone()
             # Autograd copies gradients that somebody else holds. It does not know of a second tensor in their memory.
-            changes.gradient.terms.append(FactoredTerm(of_features.detach(), changes.activations, ctx.rows))
+            changes.gradient.terms.append(FactoredTerm(of_features.data, changes.activations, ctx.rows))
         of_network = (of_features, None, of_layer1, of_layer2)
         return *[None] * 7, *of_face, *of_local, by_changed[0], *of_bases, *of_network
 

@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.adam import FactoredGradient, FactoredTerm
-from mien.arrays import native, recycled, unpacked
+from mien.arrays import native, recycled, recycled_like, unpacked
 
 SLOPE = 0.01
 """Slope of the leaky ReLU below 0."""
@@ -105,7 +105,7 @@ class _Network(torch.autograd.Function):
     def forward(ctx: Any, gradient: FactoredGradient, rows: Tensor | None, *arguments: Tensor) -> tuple[Tensor, Tensor]:
         bases, inputs, neutral, *rest = (tensor.contiguous() for tensor in arguments)
         n, outputs = len(neutral), len(rest[-1])
-        last, others = torch.empty(n), recycled(n, outputs - 1)
+        last, others = recycled(n), recycled(n, outputs - 1)
         kept: tuple[Tensor, ...] = ()
         if any(ctx.needs_input_grad):
             kept = (recycled(*neutral.shape), recycled(n, -(-len(rest[2]) // _LANES) * _LANES))
@@ -124,16 +124,16 @@ class _Network(torch.autograd.Function):
     def backward(ctx: Any, by_others: Tensor, by_last: Tensor) -> tuple[Tensor | None, ...]:
         bases, inputs, neutral, own, *layers = ctx.saved_tensors[:8]
         by_features = recycled(*neutral.shape)
-        by_inputs = torch.empty(len(inputs) if ctx.needs_input_grad[3] else 0)
-        by_own = torch.empty_like(own) if ctx.needs_input_grad[5] else None
-        by_layers = [torch.empty_like(tensor) for tensor in layers]
+        by_inputs = recycled(len(inputs) if ctx.needs_input_grad[3] else 0)
+        by_own = recycled_like(own) if ctx.needs_input_grad[5] else None
+        by_layers = [recycled_like(tensor) for tensor in layers]
         _native.feature_network_backward(
             _native.FeatureNetwork(*unpacked(neutral, own, *layers)),
             _native.FeatureBases(*unpacked(bases, torch.atleast_2d(inputs), ctx.rows)),
             _native.FeatureKept(*unpacked(*ctx.saved_tensors[8:])),
             _native.FeatureGradients(
                 *unpacked(by_others.contiguous(), by_last.contiguous(), by_features, *by_layers, by_inputs),
-                *unpacked(torch.empty(0, 0) if by_own is None else by_own),
+                *unpacked(recycled(0, 0) if by_own is None else by_own),
             ),
         )
         if ctx.needs_input_grad[2]:

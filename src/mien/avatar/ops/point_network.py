@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import native, recycled, unpacked
+from mien.arrays import native, recycled, recycled_like, unpacked
 
 SHARPNESS = 100.0
 """Sharpness of the softplus: ln(1 + exp(100 x)) / 100."""
@@ -75,8 +75,8 @@ class _PointNetwork(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, by_outputs: Tensor) -> tuple[Tensor | None, ...]:
         points, *own, kept = ctx.saved_tensors
-        by_points = torch.empty_like(points) if ctx.needs_input_grad[1] else None
-        gradients = [torch.empty_like(tensor) for tensor in own]
+        by_points = recycled_like(points) if ctx.needs_input_grad[1] else None
+        gradients = [recycled_like(tensor) for tensor in own]
         plain = unpacked(points, kept, by_outputs.contiguous(), by_points)
         into = [_native.PointLayerGradients(*unpacked(*pair)) for pair in _pairs(gradients)]
         _native.point_network_backward(

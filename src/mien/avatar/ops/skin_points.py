@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import native, unpacked
+from mien.arrays import native, recycled_like, unpacked
 
 
 def skin_points_reference(
@@ -61,7 +61,7 @@ class _SkinPoints(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Tensor) -> Tensor:
         given = [tensor.contiguous() for tensor in arguments]
-        posed = torch.empty_like(given[1])
+        posed = recycled_like(given[1])
         _native.skin_points(_native.SkinPoints(*unpacked(*given)), *unpacked(posed))
         ctx.save_for_backward(*given)
         return posed
@@ -71,7 +71,7 @@ class _SkinPoints(torch.autograd.Function):
     def backward(ctx: Any, by_posed: Tensor) -> tuple[Tensor | None, ...]:
         given = ctx.saved_tensors
         points, moved, weights, _, to_bones = given
-        by = [torch.empty_like(tensor) for tensor in (points, moved, weights, to_bones)]
+        by = [recycled_like(tensor) for tensor in (points, moved, weights, to_bones)]
         gradients = _native.SkinPointsGradients(*unpacked(by_posed.contiguous(), *by))
         _native.skin_points_backward(_native.SkinPoints(*unpacked(*given)), gradients)
         return by[0], by[1], by[2], None, by[3]

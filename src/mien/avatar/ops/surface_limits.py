@@ -51,8 +51,8 @@ def keep_on_surface(store: Tensors, limits: Float[Tensor, "f 5"], pulls: Float[T
     `pulls` are, of each triangle, a first SH coefficient and the share of the way that colours go towards it.
     """
     names = ("means", "quats", "log_scales")
-    arrays = [store[name].detach() for name in names]
-    colors = store[_COLORS].detach()[:, 0] if pulls is not None else arrays[0]
+    arrays = [store[name] for name in names]
+    colors = store[_COLORS].view(-1, 3) if pulls is not None else arrays[0]
     if is_native(*arrays, colors, limits) and all(own.is_contiguous() for own in (*arrays, colors)):
         own = None if pulls is None else pulls.contiguous()
         means, quats, log_scales = unpacked(*arrays)

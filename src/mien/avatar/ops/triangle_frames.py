@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from torch.utils.weak import WeakIdKeyDictionary
 
 from mien import _native
-from mien.arrays import native, unpacked
+from mien.arrays import native, recycled, recycled_like, unpacked
 from mien.rotation import multiply_quaternions, quaternion_from_matrix
 
 _ELLIPSE_WIDENING = 2.0
@@ -159,8 +159,8 @@ class _BindToWorld(torch.autograd.Function):
     def forward(ctx, vertices: Tensor, faces: Tensor, *gaussians: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         inputs = tuple(tensor.contiguous() for tensor in (vertices, faces, *gaussians))
         batch, count = len(vertices), len(gaussians[0])
-        frames = torch.empty(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
-        means, quats, scales = (torch.empty(batch, count, width) for width in (3, 4, 3))
+        frames = recycled(batch, len(faces), _native.TRIANGLE_FRAME_FLOATS)
+        means, quats, scales = (recycled(batch, count, width) for width in (3, 4, 3))
         known = unpacked(*inputs, frames, means, quats, scales)
         world = _native.WorldShapes(*known[7:])
         _native.rig_forward(known[0], known[1], known[2], _native.LocalShapes(*known[3:6]), known[6], world)
@@ -174,8 +174,8 @@ class _BindToWorld(torch.autograd.Function):
         vertices, *local, frames, scales = ctx.saved_tensors
         if len(vertices) == 0:
             return torch.zeros_like(vertices), None, None, *(torch.zeros_like(tensor) for tensor in local)
-        local_gradients = [torch.empty_like(tensor) for tensor in local]
-        vertex_gradient = torch.empty_like(vertices) if ctx.needs_input_grad[0] else None
+        local_gradients = [recycled_like(tensor) for tensor in local]
+        vertex_gradient = recycled_like(vertices) if ctx.needs_input_grad[0] else None
         world = [gradient.contiguous() for gradient in world_gradients]
         topology = rig_topology(vertices.shape[1], ctx.faces, ctx.face_index)
         inputs = (vertices, *local, frames, scales, *world)

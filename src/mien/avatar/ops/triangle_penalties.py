@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import native, unpacked
+from mien.arrays import native, recycled, recycled_like, times, unpacked
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
@@ -51,16 +51,12 @@ class _TrianglePenalties(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, log_scales: Tensor, radii: Tensor, thresholds: _Pair, weights: _Pair):
         inputs = unpacked(*(tensor.contiguous() for tensor in (means, log_scales, radii)))
-        gradients, values = (torch.empty_like(means), torch.empty_like(log_scales)), (torch.empty(()), torch.empty(()))
+        gradients, values = (recycled_like(means), recycled_like(log_scales)), (recycled(), recycled())
         _native.triangle_penalties(thresholds, weights, *inputs, *unpacked(*gradients, *values))
-        ctx.save_for_backward(*gradients)
+        ctx.gradients = gradients
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:
-        scaled = [
-            gradient if float(factor) == 1 else gradient * factor
-            for gradient, factor in zip(ctx.saved_tensors, output_gradients, strict=True)
-        ]
-        return *scaled, None, None, None
+        return *map(times, ctx.gradients, output_gradients), None, None, None

@@ -57,7 +57,7 @@ class GradientStrategy(DensityStrategy):
         assert gradient is not None, "observe() needs the gradients of a backward pass"
         height, width = rendering.image.shape[-3:-1]
         # Scale pixels to normalised device coordinates, which span -1..1: the unit of the thresholds.
-        scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.detach().reshape(-1)
+        scale, opacities = (width / 2, height / 2), posed.gaussians.opacities.data.view(-1)
         statistics = (self._gradient_sums, self._views, self._largest_radii, self._highest_opacities)
         if is_native(gradient):
             arrays = unpacked(gradient, rendering.radii, opacities, *statistics)

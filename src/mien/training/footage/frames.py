@@ -222,16 +222,19 @@ class FrameOrder:
 
 def background_at(settings: TrainSettings, step: int) -> UInt8[np.ndarray, " 3"]:
     """The background colour of a step, 0 to 255."""
-    generator = random_at(settings.seed, BACKGROUND, step)
-    color = torch.randint(256, (3,), generator=generator).numpy().astype(np.uint8)
-    drawn = settings.background == "random" or (
-        settings.background == "mixed" and float(torch.rand((), generator=generator)) < _MIXED_SHARE
-    )
-    return color if drawn else np.full(3, 255, dtype=np.uint8)
+    if settings.background == "white":
+        return np.full(3, 255, dtype=np.uint8)
+    *color, high, low = _random_bytes(settings.seed, BACKGROUND, step, 5)
+    drawn = settings.background == "random" or 256 * high + low < 65536 * _MIXED_SHARE
+    return np.array(color if drawn else [255] * 3, dtype=np.uint8)
 
 
 def random_at(seed: int, purpose: int, step: int) -> torch.Generator:
     """A generator that depends only on these three numbers."""
     # torch's CPU generator uses only the low 32 bits of its seed, so the three numbers are hashed into them.
-    digest = hashlib.blake2b(f"{seed} {purpose} {step}".encode(), digest_size=4).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest, "little"))
+    return torch.Generator().manual_seed(int.from_bytes(_random_bytes(seed, purpose, step, 4), "little"))
+
+
+def _random_bytes(seed: int, purpose: int, step: int, count: int) -> bytes:
+    """Bytes that depend only on these numbers."""
+    return hashlib.blake2b(f"{seed} {purpose} {step}".encode(), digest_size=count).digest()

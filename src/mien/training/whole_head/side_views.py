@@ -9,10 +9,11 @@ pulled towards those of the mesh. In raised expressions, a difference that a rea
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar, Posed
@@ -21,11 +22,14 @@ from mien.camera import Camera
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.machine import exact
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh, vertex_normals
-from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.tracking.neck_cut import NeckParts, fit_neck_cut
 from mien.tracking.scoring import head_mask
+from mien.training.footage.sequence import composite
+from mien.training.losses import alpha_loss, color_loss
 from mien.training.whole_head.completion import vertex_means
 from mien.training.whole_head.unseen import Unseen
 
@@ -58,10 +62,10 @@ class SideView:
     """Whether the expression is raised."""
     camera: Camera
     background: Float[Tensor, " 3"]
-    picture: Float[Tensor, "h w 3"]
+    picture: UInt8[Tensor, "h w 3"]
     """The completed mesh over the background."""
-    alpha: Float[Tensor, "h w"]
-    """Its alpha."""
+    matte: UInt8[Tensor, "h w"]
+    """Its opacity."""
     compared: Bool[Tensor, "h w"]
     """Pixels that show triangles of `SideViews.compared`."""
 
@@ -101,20 +105,19 @@ class SideViews:
         """
         raised = step % _SIDE_VIEWS_EVERY != 0
         angle = _drawn_angle(raised, random)
-        # The same tensor of the identity says that the person's shape at rest need not be computed again.
-        face = replace(turned_to_side(face.detach(), angle), identity=face.identity, vertex_offsets=face.vertex_offsets)
+        face, up = turned_to_side(face, angle)
         if raised:
             face = replace(face, expression=self.raised(face.expression, random))
         scale = _SIDE_VIEWS_SIZE / max(camera.width, camera.height)
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-        background = torch.rand(3, generator=random)
+        background = torch.randint(256, (3,), generator=random).numpy().astype(np.uint8)
         # Threads share the core's pool, and a loop of one makes those of the other serial. So the mesh is posed here.
         posed = self.face_model(face.to(self.colors))[0]
-        up = face.T_world_head[0, :3, 1].to(self.colors)
 
         @torch.no_grad()
         def make() -> SideView:
-            return SideView(face, raised, small, background, *self._pictures(posed, up, small, background))
+            over = torch.from_numpy(background.astype(np.float32) / 255)
+            return SideView(face, raised, small, over, *self._pictures(posed, up, small, background))
 
         return make
 
@@ -122,28 +125,34 @@ class SideViews:
         """The weighted difference between the avatar and the completed mesh in one side view."""
         like, posed = view.face.expression, avatar.pose(view.face, progress)
         seen = rasterize(posed.gaussians.timestep(0), view.camera, view.background.to(like))
-        difference = (seen.image - view.picture.to(like)).abs()
+        picture, counted = view.picture.to(like.device), view.compared.to(like.device)
         if view.raised:
-            free = _RAISED_FREE_DIFFERENCE
-            difference = (difference - free).clamp_min(0) * view.compared.to(like)[..., None]
-            return self.weight * difference.mean() + _held_back(avatar, posed, self.compared)
-        outline = _SIDE_VIEWS_OUTLINE_WEIGHT * (seen.alpha - view.alpha.to(like)).abs().mean()
-        return self.weight * (difference.mean() + outline)
+            own = color_loss(seen.image, picture, self.weight, _RAISED_FREE_DIFFERENCE, counted)
+            return own + _held_back(avatar, posed, self.compared)
+        outline = alpha_loss(seen.alpha, view.matte.to(like.device), self.weight * _SIDE_VIEWS_OUTLINE_WEIGHT)
+        return color_loss(seen.image, picture, self.weight) + outline
 
     def _pictures(
-        self, vertices: Float[Tensor, "v 3"], up: Float[Tensor, " 3"], camera: Camera, background: Float[Tensor, " 3"]
-    ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Picture, alpha and compared pixels, given the posed mesh and the head's upright axis in the world."""
+        self,
+        vertices: Float[Tensor, "v 3"],
+        up: Float[Tensor, " 3"],
+        camera: Camera,
+        background: UInt8[np.ndarray, " 3"],
+    ) -> tuple[UInt8[Tensor, "h w 3"], UInt8[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """Picture, matte and compared pixels, given the posed mesh and the head's upright axis in the world."""
         camera, faces = camera.to(self.colors), self.face_model.faces
         raised = vertices + self.height[:, None] * vertex_normals(vertices, faces)
-        index = rasterize_mesh(raised, faces, camera).face_index.long()
-        matte = np.where(index.numpy() >= 0, 255, 0).astype(np.uint8)
-        cut = fit_neck_cut(self.neck, vertices, up)
-        alpha = torch.from_numpy(head_mask(matte, camera, vertices, self.head_faces, cut)).float() / 255
-        triangle: Int[Tensor, " p"] = index.clamp_min(0).flatten()
-        colors = self.colors.index_select(0, triangle).view(*index.shape, 3)
-        picture = background + alpha[..., None] * (colors - background)
-        return picture, alpha, self.compared.index_select(0, triangle).view(index.shape) & (alpha > 0)
+        index = rasterize_mesh(raised, faces, camera).face_index.numpy()
+        drawn = np.where(index >= 0, 255, 0).astype(np.uint8)
+        matte = head_mask(drawn, camera, vertices, self.head_faces, fit_neck_cut(self.neck, vertices, up))
+        triangle = np.maximum(index, 0)
+        picture = composite(self._bytes_of_colors[triangle], matte, background)
+        compared = self.compared.numpy()[triangle] & (matte > 0)
+        return torch.from_numpy(picture), torch.from_numpy(matte), torch.from_numpy(compared)
+
+    @cached_property
+    def _bytes_of_colors(self) -> UInt8[np.ndarray, "f 3"]:
+        return np.rint(255 * self.colors.numpy()).astype(np.uint8)
 
     def raised(self, expression: Float[Tensor, "1 e"], random: torch.Generator) -> Float[Tensor, "1 e"]:
         """The expression with some coefficients anywhere between 0 and their largest value."""
@@ -196,14 +205,17 @@ def _held_back(avatar: Avatar, posed: Posed, compared: Bool[Tensor, " f"]) -> Fl
     return 0.0 if penalty is None else _RAISED_CHANGE_WEIGHT * penalty
 
 
-def turned_to_side(face: FaceParams, angle: float) -> FaceParams:
-    """The head turned about its own upright axis by an angle in radians, at the same place.
+def turned_to_side(face: FaceParams, angle: float) -> tuple[FaceParams, Float[Tensor, " 3"]]:
+    """The head turned about its own upright axis by an angle in radians, at the same place; and this axis in the world.
 
-    A camera sees it as one that goes around the head by this angle.
+    A camera sees it as one that goes around the head by this angle. The face has no gradient. Its identity is the same
+    tensor, which says that the person's shape at rest need not be computed again.
     """
-    turn = matrix_from_axis_angle(torch.tensor([0.0, angle, 0.0]).to(face.head_rotation))
-    rotation = matrix_from_axis_angle(face.head_rotation) @ turn
-    return replace(face, head_rotation=axis_angle_from_matrix(rotation))
+    before = matrix_from_axis_angle(face.head_rotation.detach().cpu().numpy()[0])
+    rotation = exact.product(before, matrix_from_axis_angle(np.array([0.0, angle, 0.0])))
+    turned = torch.from_numpy(axis_angle_from_matrix(rotation)[None]).to(face.head_rotation)
+    fields = {name: getattr(face, name).detach() for name in ("expression", "joints", "head_translation")}
+    return replace(face, head_rotation=turned, **fields), torch.from_numpy(rotation[:, 1])
 
 
 def _drawn_angle(raised: bool, random: torch.Generator) -> float:
