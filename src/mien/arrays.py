@@ -1,6 +1,8 @@
 """Conversion of tensors for the native core."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -61,6 +63,41 @@ def unpacked(*tensors: Tensor | None) -> list[Any]:
     capsule can be consumed only once, so a second overload could not read it.
     """
     return _native.unpacked(*tensors)
+
+
+@dataclass
+class _Way:
+    direct: bool = False
+
+
+_WAY = _Way()
+
+
+@contextmanager
+def direct_gradients() -> Iterator[None]:
+    """Let backward passes of the core give gradients to leaves themselves, for which PyTorch takes four operators each.
+
+    It is for `torch.autograd.backward` alone: `torch.autograd.grad` would not get them.
+    """
+    _WAY.direct = True
+    try:
+        yield
+    finally:
+        _WAY.direct = False
+
+
+def left_to_autograd(inputs: Sequence[Tensor | None], gradients: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """The gradients that PyTorch has to hand on: all, or within `direct_gradients` those of inputs that are no leaves.
+
+    The other leaves get theirs.
+    """
+    left = list(gradients)
+    for index, (leaf, gradient) in enumerate(zip(inputs, gradients, strict=True)):
+        if _WAY.direct and leaf is not None and gradient is not None and leaf.is_leaf and leaf.requires_grad:
+            # The sum has memory of its own: a factored term may share that of the gradient before.
+            leaf.grad = gradient if leaf.grad is None else leaf.grad + gradient
+            left[index] = None
+    return left
 
 
 ONE = torch.ones(())

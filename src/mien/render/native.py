@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, unpacked
 from mien.camera import Camera
 from mien.gaussians import Gaussians, Rendering
 from mien.render.validation import TooManyPairsError, check_finite
@@ -87,7 +87,8 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[2::3])
         # PyTorch would make a tensor of each that it saves. A picture would keep itself, but for its history.
-        ctx.kept, ctx.pictures = kept, [output.data for output in outputs if output.is_floating_point()]
+        ctx.offsets, ctx.kept = inputs[::_INPUTS], kept
+        ctx.pictures = [output.data for output in outputs if output.is_floating_point()]
         return tuple(outputs)
 
     @staticmethod
@@ -111,6 +112,7 @@ class _Rasterize(torch.autograd.Function):
         result: list[Tensor | None] = [None]
         for index, (grad_image, alpha, *found) in enumerate(views):
             *grad_parameters, grad_means2d, grad_viewmat, grad_K = found
+            (grad_means2d,) = left_to_autograd([ctx.offsets[index]], [grad_means2d])
             needs_background, needs_viewmat, needs_K = ctx.needs_input_grad[1 + _INPUTS * index + 6 :][:3]
             result += (grad_means2d, *grad_parameters)
             result.append(torch.einsum("hwc,hw->c", grad_image, 1 - alpha) if needs_background else None)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mien.arrays import own_derivative
+from mien.arrays import direct_gradients, own_derivative
 from mien.avatar.avatar import Avatar, Posed, move_avatar
 from mien.avatar.baking import measure_filmed
 from mien.avatar.density import DensityControl, GradientDensity
@@ -314,7 +314,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     losses |= compare_features(state, batch, shown)
     if head is not None:
         losses |= head.losses(progress)
-    torch.autograd.backward(list(losses.values()), [own_derivative(loss) for loss in losses.values()])
+    with direct_gradients():
+        torch.autograd.backward(list(losses.values()), [own_derivative(loss) for loss in losses.values()])
     if head is not None:
         head.after_backward(progress, renderings)
 

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.adam import FactoredGradient, FactoredTerm
-from mien.arrays import recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.bound_gaussians import LOCAL, pose_bound_gaussians, prepare_posing
 from mien.avatar.ops.feature_network import Layers, feature_network
@@ -137,7 +137,8 @@ class _ChangedGaussians(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         # PyTorch would make a tensor of each that it saves. Those that are returned are kept without their history,
         # since they would otherwise keep themselves.
-        ctx.arrays, ctx.found = arrays, [None if one is None else one.data for one in (*posed[2:4], *changed)]
+        ctx.inputs, ctx.arrays = inputs, arrays
+        ctx.found = [None if one is None else one.data for one in (*posed[2:4], *changed)]
         linear = changed[-2] if any(basis is not None for basis in bases) else None
         return (
             *posed[:4],
@@ -183,7 +184,8 @@ class _ChangedGaussians(torch.autograd.Function):
             # Autograd copies gradients that somebody else holds. It does not know of a second tensor in their memory.
             changes.gradient.terms.append(FactoredTerm(of_features.data, changes.activations, ctx.rows))
         of_network = (of_features, None, of_layer1, of_layer2)
-        return *[None] * 7, *of_face, *of_local, by_changed[0], *of_bases, *of_network
+        found = (None, None, *of_face, *of_local, by_changed[0], *of_bases, *of_network)
+        return *[None] * 5, *left_to_autograd(ctx.inputs, found)
 
 
 def _posing_groups(arrays: Sequence[Tensor | None]) -> tuple[Any, Any]:

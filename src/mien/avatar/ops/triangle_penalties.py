@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import native, recycled, recycled_like, times, unpacked
+from mien.arrays import left_to_autograd, native, recycled, recycled_like, times, unpacked
 
 _Pair = tuple[float, float]
 """A value for centres, and one for scales."""
@@ -53,10 +53,10 @@ class _TrianglePenalties(torch.autograd.Function):
         inputs = unpacked(*(tensor.contiguous() for tensor in (means, log_scales, radii)))
         gradients, values = (recycled_like(means), recycled_like(log_scales)), (recycled(), recycled())
         _native.triangle_penalties(thresholds, weights, *inputs, *unpacked(*gradients, *values))
-        ctx.gradients = gradients
+        ctx.inputs, ctx.gradients = (means, log_scales), gradients
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return *map(times, ctx.gradients, output_gradients), None, None, None
+        return *left_to_autograd(ctx.inputs, [*map(times, ctx.gradients, output_gradients)]), None, None, None
