@@ -271,7 +271,7 @@ def test_a_new_store_and_changed_indices_are_noticed(anny: FaceModel) -> None:
     assert torch.equal(posed().means, expected)
     assert not torch.equal(posed().means, before.means)
     store.select(torch.arange(100))
-    assert posed().means.shape == (1, 100, 3)
+    assert posed().means.shape == (100, 3)
     store["face_index"][0] = len(anny.faces)
     with pytest.raises(IndexError, match="face"):
         posed()

@@ -19,6 +19,7 @@ from mien.errors import UserError
 from mien.face import FaceModel
 from mien.face.mirror import triangle_geometry
 from mien.face.posing import head_poses
+from mien.runtime.checks import baked_fault
 from mien.training import PRESETS
 from mono_avatars import SMALL, new_avatar, pictured
 from plain_settings import plain_mono_gaussian_avatar
@@ -180,6 +181,15 @@ def test_attributes_are_those_at_rest_and_their_change() -> None:
     assert means.grad is None, "they do not pull at points"
     got.means.sum().backward()
     assert means.grad is not None
+
+
+def test_logits_of_scales_may_be_as_large_as_they_like() -> None:
+    """The preset `paper` ends with some of 34."""
+    avatar = new_avatar()
+    own = avatar.store["own_attributes"].detach().clone()
+    own[0, :3] = 40.0
+    avatar.store.assign("own_attributes", own)
+    assert baked_fault(avatar.bake()) is None
 
 
 def test_schedules_are_those_of_paper_and_code() -> None:

@@ -135,15 +135,15 @@ def test_changes_beside_the_mesh_cost_in_raised_expressions_only(anny):
 
 def test_the_outline_has_the_hair_and_ends_at_the_cut_at_the_neck(anny):
     view, hairy = (_view(_views(anny, hair=hair), _face(anny), 0) for hair in (0.0, _HAIR))
-    face, camera, alpha = view.face, view.camera, view.alpha
-    assert float(hairy.alpha.sum()) > 1.05 * float(alpha.sum())
+    face, camera, alpha = view.face, view.camera, view.matte
+    assert float(hairy.matte.float().sum()) > 1.05 * float(alpha.float().sum())
     vertices = anny(face)[0]
     head = rasterize_mesh(vertices, anny.faces[~anny.region_mask("neck")], camera).face_index >= 0
-    assert bool((alpha[head] == 1).all())
+    assert bool((alpha[head] == 255).all())
     bare = np.where(rasterize_mesh(vertices, anny.faces, camera).face_index.numpy() >= 0, 255, 0).astype(np.uint8)
     expected = head_cutter(anny, NeckParts.of(anny), face)(bare, camera)
     assert alpha.equal(torch.from_numpy(expected).float() / 255)
-    assert float(alpha.sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
+    assert float(alpha.float().sum()) < 0.97 * (bare > 0).sum(), "the mesh goes on below the cut"
     shown = view.picture[alpha == 0]
     torch.testing.assert_close(shown, view.background.expand(len(shown), 3))
 
