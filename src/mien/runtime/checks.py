@@ -28,7 +28,7 @@ MAX_SHAPES = 256
 """Largest number of expressions, plus nine for each free joint, that native/face.h accepts."""
 _MAX_NAME = 1000
 """Most characters of a name or of another text."""
-_MAX_LOG_SCALE = 30
+MAX_LOG_SCALE = 30
 """Largest logarithm of a scale. Its exponential, and the square of that, still fit into float32."""
 
 
@@ -138,10 +138,8 @@ def _baked_faults(baked: BakedAvatar, sizes: dict[str, int]) -> Iterator[str]:
         yield from _changes_faults(baked.changes, sizes)
     yield from _array_faults(baked, sizes, "baked")
     attributes = baked.attributes
-    # Scales of `BlendSkinned` are sigmoids of these numbers, which may be as large as they like.
-    exponents = attributes.log_scales[: 0 if isinstance(baked, BlendSkinned) else None]
-    if not np.abs(exponents).max(initial=0) <= _MAX_LOG_SCALE:
-        yield f"a scale is beyond exp({_MAX_LOG_SCALE})"
+    if not np.abs(attributes.log_scales).max(initial=0) <= MAX_LOG_SCALE:
+        yield f"a scale is beyond exp({MAX_LOG_SCALE})"
     if attributes.sh.shape[1] not in (1, 4, 9, 16):
         yield f"it has {attributes.sh.shape[1]} SH coefficients per channel, not 1, 4, 9 or 16"
     if isinstance(baked, MeshBound):

@@ -42,6 +42,7 @@ from mien.face.params import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians, Rendering, sh_from_rgb
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
+from mien.runtime.checks import MAX_LOG_SCALE
 
 
 class MonoGaussianAvatar(FreePoints):
@@ -142,7 +143,8 @@ class MonoGaussianAvatar(FreePoints):
         )
         attributes = Attributes(
             quats=as_array(raw["quats"]),
-            log_scales=as_array(raw["log_scales"]),
+            # Sigmoids of larger numbers are the same in float32, and no file may hold them.
+            log_scales=as_array(raw["log_scales"].clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)),
             opacity_logits=as_array(raw["opacity_logits"][..., 0]),
             sh=as_array(raw["sh"][:, None]),
         )
