@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from instruction_sets import by_threads
+from known import known
 from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.gaussian_avatars.avatar import GaussianAvatars, never_empty_a_triangle
 from mien.avatar.ops import surface_limits as limits
@@ -21,6 +22,7 @@ from mien.face import FaceModel, FaceParams
 from mien.gaussians import Gaussians, world_means
 from mien.render import rasterize
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
+from mien.runtime.checks import baked_fault
 from mono_avatars import pictured
 from plain_settings import plain_gaussian_avatars
 from toy_scene import rgb_from_sh, surface_of, toy_camera, toy_face, toy_face_model
@@ -37,6 +39,16 @@ def test_starts_with_one_gray_faint_gaussian_a_triangle() -> None:
     torch.testing.assert_close(world_means(gaussians), model(face)[:, model.faces].mean(-2), atol=1e-6, rtol=0)
     torch.testing.assert_close(gaussians.opacities, torch.full((len(model.faces),), 0.1))
     assert (rgb_from_sh(gaussians.sh) - 0.5).abs().max() < 0.002
+
+
+def test_gaussians_that_shrink_to_nothing_have_a_record_and_those_that_grow_beyond_all_have_none() -> None:
+    """The preset `paper` ends with a logarithm of -30.2."""
+    avatar = new_avatar()
+    sizes = avatar.store["log_scales"].detach().clone()
+    avatar.store.assign("log_scales", sizes.index_fill(0, torch.tensor([1]), -40.0))
+    assert baked_fault(avatar.bake()) is None
+    avatar.store.assign("log_scales", sizes.index_fill(0, torch.tensor([1]), 40.0))
+    assert "beyond exp(30)" in known(baked_fault(avatar.bake()))
 
 
 def test_first_colors_are_the_means_of_the_triangles_corners() -> None:

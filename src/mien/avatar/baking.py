@@ -29,7 +29,13 @@ from mien.face.posing import head_poses
 from mien.gaussians import Gaussians
 from mien.runtime import baked
 from mien.runtime.baked import About, BakedAvatar, Filmed, Neutral, PortableAvatar, Rig
+from mien.runtime.checks import MAX_LOG_SCALE
 from mien.runtime.filmed import head_angles
+
+
+def as_log_scales(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Logarithms of scales for a record. Long runs shrink a few Gaussians to nothing, and no file may hold less."""
+    return np.maximum(values, np.float32(-MAX_LOG_SCALE))
 
 
 @torch.no_grad()

@@ -241,9 +241,7 @@ class _ColorLoss(torch.autograd.Function):
     """One native pass computes value and gradient; `backward` only scales the gradient."""
 
     @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, picture: Tensor, weight: float, free: float, counted: Tensor | None
-    ) -> Tensor:
+    def forward(ctx: Any, image: Tensor, picture: Tensor, weight: float, free: float, counted: Tensor | None) -> Tensor:
         gradient, loss = recycled_like(image), recycled()
         known = None if counted is None else counted.contiguous().view(torch.uint8)
         own, target, chosen, *filled = unpacked(image.contiguous(), picture.contiguous(), known, gradient, loss)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mien.adam import FactoredGradient
 from mien.avatar.avatar import Avatar, Extras, ParameterGroup, Posed, store_group
-from mien.avatar.baking import as_array, bake_rig
+from mien.avatar.baking import as_array, as_log_scales, bake_rig
 from mien.avatar.bound_surface import BoundSurface
 from mien.avatar.density import GradientDensity
 from mien.avatar.gaussian_avatars.changes import APPEARANCE_WEIGHT, FeatureAppearance, feature_tensors
@@ -165,7 +165,7 @@ class GaussianAvatars(Avatar):
             faces=as_array(self.face_model.faces),
             face_index=store["face_index"],
             means=store["means"],
-            attributes=Attributes(store["quats"], store["log_scales"], store["opacity_logits"], sh),
+            attributes=Attributes(store["quats"], as_log_scales(store["log_scales"]), store["opacity_logits"], sh),
             sh_frame=self._sh_frame,
             changes=self._bake_changes(),
         )

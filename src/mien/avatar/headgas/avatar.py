@@ -26,7 +26,7 @@ from mien.avatar.avatar import (
     network_group,
     store_group,
 )
-from mien.avatar.baking import Kept, as_array, can_pose_baked, pose_baked
+from mien.avatar.baking import Kept, as_array, as_log_scales, can_pose_baked, pose_baked
 from mien.avatar.density import GradientDensity
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.avatar.headgas.variants import (
@@ -179,7 +179,7 @@ class HeadGas(Avatar):
         weights[-1], biases[-1] = weights[-1] * shares[:, None], biases[-1] * shares
         layers = tuple(map(as_array, weights)), tuple(map(as_array, biases))
         none, no_sh = np.zeros(n, np.float32), np.zeros((n, colors_of(self.config) // 3, 3), np.float32)
-        attributes = Attributes(store["quats"], store["log_scales"], none, no_sh)
+        attributes = Attributes(store["quats"], as_log_scales(store["log_scales"]), none, no_sh)
         names, free = self.face_model.expression_names, self.face_model.free_joint_names
         if self.activations is not None:
             features = FeatureChanges(store["neutral_features"], store["bases"], as_array(self.encoding()), *layers)

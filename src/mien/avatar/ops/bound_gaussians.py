@@ -34,8 +34,8 @@ def pose_bound_gaussians(
 
     The tensors are `face_index`, `means, quats, log_scales` in triangle units, and `opacity_logits`. The Gaussians are
     in world space or, with `in_head`, in the head frame together with its pose. There is one batch entry per timestep,
-    and no batch axis for a single one. Differentiable in the store and in `face`. A single timestep on a CPU, which is the case in training, takes one
-    native call forward and one backward.
+    and no batch axis for a single one. Differentiable in the store and in `face`. A single timestep on a CPU, which is
+    the case in training, takes one native call forward and one backward.
     """
     prepared = prepare_posing(face_model, face, store)
     if prepared is None:
