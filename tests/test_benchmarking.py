@@ -73,6 +73,11 @@ def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.Monkey
     assert _native.rasterize_isa() == best
 
 
+MOST_OPERATORS = 330
+"""Most operators of PyTorch in a step of the default, nested ones included: a mean over steps with and without rare
+losses. PyTorch's own engine has 60 of them."""
+
+
 def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """All that a step does is in some row, each native operation in its own, and nothing stays watched."""
     reads: list[int] = []
@@ -97,6 +102,10 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = step_parts.format_parts(rows)
     assert "a step, " in shown
     assert shown.count("ride_changes_backward") == 1
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        for _ in range(50):
+            step(state, data, settings)
+    assert len(list(profile.events())) / 50 < MOST_OPERATORS
 
 
 @pytest.mark.parametrize(

@@ -206,7 +206,8 @@ def test_the_preset_for_processors_is_that_of_the_paper_with_fewer_frames_and_po
     method, small, paper = "mono_gaussian_avatar", PRESETS["paper-cpu"], PRESETS["paper"]
     config: Any = small.config(method)
     settings = small.settings_of(method)
-    assert replace(config, max_points=100_000) == paper.config(method)
+    assert replace(config, max_points=100_000, frames_per_step=8) == paper.config(method)
+    assert (config.max_points, config.frames_per_step) == (20_000, 1)
     assert replace(settings, steps=300_000) == paper.settings_of(method)
     assert [name for name in METHODS if "paper-cpu" in METHODS[name].presets] == [method]
 

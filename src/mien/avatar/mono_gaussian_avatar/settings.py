@@ -96,7 +96,8 @@ _CPU_FRAMES = 30
 PRESETS: dict[str, Differences] = {
     "paper": {"method": _PAPER, "settings": {"steps": _PAPER_EPOCHS * _PAPER_FRAMES}},
     "paper-cpu": {
-        "method": _PAPER | {"max_points": 20_000},
+        # Of eight frames a step, 650 updates would be left, and the avatar would be a smear.
+        "method": _PAPER | {"max_points": 20_000, "frames_per_step": 1},
         "settings": {"steps": _PAPER_EPOCHS * _CPU_FRAMES},
     },
 }
