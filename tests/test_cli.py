@@ -32,7 +32,6 @@ Told = pytest.CaptureFixture[str]
 
 
 def help_of(capsys: Told, *arguments: str) -> str:
-    """Ask for help, and return it."""
     with pytest.raises(SystemExit, match="^0$"):
         main(arguments)
     return capsys.readouterr().out

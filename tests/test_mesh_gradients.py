@@ -197,7 +197,6 @@ def barycentrics_reference(
 
 
 def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n c"]:
-    """Reference of `mien.render.mesh.sample_texture`."""
     grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], dim=-1).reshape(1, 1, -1, 2)
     sampled = grid_sample(
         texture.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
@@ -206,7 +205,6 @@ def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor
 
 
 def antialias_reference(image, fragments, points, faces, edges) -> Float[Tensor, "h w c"]:
-    """Reference of `mien.render.mesh_gradients.antialias`."""
     inner, outer, position = _crossings(fragments, points, faces, edges)
     beyond = position - 0.5
     changed, other = torch.where(beyond > 0, outer, inner), torch.where(beyond > 0, inner, outer)

@@ -71,7 +71,6 @@ class Call:
         return bool(self.rng.random() < share)
 
     def maybe(self, value: Any, share: float = 0.5) -> Any:
-        """Return the value, or None."""
         return value if self.flag(share) else None
 
     def picture(self) -> tuple[int, int]:
