@@ -38,7 +38,6 @@ def run_evaluation_stage(
         metrics = read_metrics(run_dir)
     else:
         named = read_run_config(run_dir)["settings"]["split"] == NAMED_SPLIT
-        say(f"{run}: scores its held-out frames; the first figures may take minutes")
         metrics = evaluate(run_dir, folders, settings, driver_folders(drivers, driving_sequences if named else list))
     with expect_whole(run_dir / "metrics.json", REMEDY):
         for name, entry in metrics["protocols"].items():
