@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-times test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
+.PHONY: setup landmarker web-packages chromium web build demo test test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -74,12 +74,6 @@ demo: setup
 # Everything that a change can break: one process a core, each with one thread (tests/conftest.py says how many).
 test: setup web-packages chromium
 	MIEN_THREADS=1 $(BIN)/pytest -n auto -m "not long"
-
-# The same, and a table at its end: where the seconds go.
-test-times: setup web-packages chromium
-	mkdir -p out && rm -f out/test_times.jsonl
-	MIEN_TEST_TIMES=$(abspath out/test_times.jsonl) PYTHONPATH=tests MIEN_THREADS=1 $(BIN)/pytest -p times -n auto -m "not long"
-	$(BIN)/python tests/times.py out/test_times.jsonl
 
 # Campaigns, which take hours. SAMPLE=1 runs a sample of each, as CI does. Its seed is the date of the commit, so that the same
 # commit always runs the same sample; SEED says another.

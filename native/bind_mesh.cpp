@@ -132,34 +132,6 @@ void interpolate_mesh(const FaceIndex& face_index, const Image& barycentric, con
                          attributes.data(), corners.data(), channels, out.data());
 }
 
-void barycentric_backward(const Group<Fragments>& fragment_group, const Points& points, const Faces& faces,
-                          const Image& grad_barycentric, const PointSums& grad_points) {
-  const Fragments fragments(fragment_group);
-  require(same_shape(grad_barycentric, fragments.barycentric) && same_shape(grad_points, points),
-          "a gradient must have the shape of its array");
-  const nb::gil_scoped_release release;
-  const mien::ImageMesh mesh = mesh_of(points, faces);
-  mien::barycentric_backward(fragments.of(mesh), mesh, grad_barycentric.data(), grad_points.data());
-}
-
-void interpolate_backward(const FaceIndex& face_index, const Image& barycentric, const Rows& attributes,
-                          const Faces& corners, const Image& grad_out, const Grad<float>& grad_attributes,
-                          const Grad<float>& grad_barycentric) {
-  const int channels = checked_length(attributes.shape(1), "numbers per vertex");
-  const PictureSize size = picture_size(face_index);
-  require(has_shape(grad_out, size.height, size.width, channels) && has_shape(barycentric, size.height, size.width, 3),
-          "grad_out must hold one row of attributes per pixel");
-  float* by_attributes = data_or_null(grad_attributes, attributes, "grad_attributes has another size");
-  float* by_barycentric = data_or_null(grad_barycentric, barycentric, "grad_barycentric has another size");
-  const nb::gil_scoped_release release;
-  check_indices(corners, static_cast<int64_t>(attributes.shape(0)), "a face names a vertex that does not exist");
-  check_indices(face_index, static_cast<int64_t>(corners.shape(0)), "the fragments name a triangle that does not exist",
-                -1);
-  const mien::Fragments fragments{face_index.data(), barycentric.data(), nullptr, size.width, size.height};
-  mien::interpolate_backward(fragments, attributes.data(), corners.data(), channels, grad_out.data(), by_attributes,
-                             by_barycentric);
-}
-
 template <typename T>
 mien::TextureView texture_of(const T& texture) {
   require(texture.size() > 0, "the texture is empty");
@@ -293,10 +265,6 @@ void bind_mesh(nb::module_& module) {
              "fragments"_a);
   module.def("interpolate_mesh", &interpolate_mesh, "face_index"_a, "barycentric"_a, "attributes"_a, "corners"_a,
              "out"_a);
-  module.def("barycentric_backward", &barycentric_backward, "fragments"_a, "points"_a, "faces"_a, "grad_barycentric"_a,
-             "grad_points"_a);
-  module.def("interpolate_mesh_backward", &interpolate_backward, "face_index"_a, "barycentric"_a, "attributes"_a,
-             "corners"_a, "grad_out"_a, "grad_attributes"_a.none(), "grad_barycentric"_a.none());
   module.def("sample_texture", &sample_texture, "texture"_a, "uv"_a, "out"_a);
   module.def("sample_texture_backward", &sample_texture_backward, "texture"_a, "uv"_a, "grad_out"_a,
              "grad_texture"_a.none(), "grad_uv"_a.none());

@@ -23,15 +23,6 @@ struct ImageMesh {
   int64_t face_count;
 };
 
-// Adds the gradient of the points to `grad_points` [v,3], from that of the barycentrics [h,w,3]. Weights that were
-// clamped to 0 have no gradient.
-void barycentric_backward(const Fragments& fragments, const ImageMesh& mesh, const float* grad_barycentric,
-                          double* grad_points);
-
-// Writes `grad_barycentric` [h,w,3] and adds to `grad_attributes` [a,c]; either may be null.
-void interpolate_backward(const Fragments& fragments, const float* attributes, const int64_t* corners, int channels,
-                          const float* grad_out, float* grad_attributes, float* grad_barycentric);
-
 struct TextureView {
   const float* texels;  // [th,tw,c]; the first row is at the top, v = 1
   int width;

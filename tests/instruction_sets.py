@@ -11,7 +11,6 @@ ISAS = ("avx512", "avx2", "sse4") if platform.machine() in ("x86_64", "AMD64") e
 
 
 def by_threads(compute: Callable[[], T], counts: tuple[int, ...] = (1, 3)) -> list[T]:
-    """Compute the same with each number of threads."""
     before, results = _native.thread_count(), []
     try:
         for count in counts:

@@ -85,7 +85,6 @@ def leaves(scene: Scene) -> dict[str, Tensor]:
 
 
 def render(scene: Scene, tensors: dict[str, Tensor], backend: Backend) -> Rendering:
-    """Render the scene with its tensors replaced."""
     gaussians = Gaussians(**{name: tensors[name] for name in PARAMETERS})
     camera = Camera(tensors["K"], tensors["viewmat"], scene.camera.width, scene.camera.height)
     return rasterize_anywhere(gaussians, camera, tensors["background"], backend)
@@ -94,7 +93,6 @@ def render(scene: Scene, tensors: dict[str, Tensor], backend: Backend) -> Render
 def gradients(
     scene: Scene, backend: Backend, loss: Callable[[Rendering], Tensor]
 ) -> tuple[Rendering, dict[str, Tensor]]:
-    """Return the rendering, and the gradients of a loss on it."""
     tensors = leaves(scene)
     rendering = render(scene, tensors, backend)
     loss(rendering).backward()

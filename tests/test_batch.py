@@ -170,6 +170,7 @@ def test_the_percentage_is_that_of_the_present_stage(tmp_path: Path, mortal: Hol
             ("stage 2 of 4 (tracking), about 9 min left\nOverlay: 100/100 in 5 s\n", "tracking (2 of 4)", 100),
             ("stage 3 of 4 (training), about 3 min left\n", "training (3 of 4)", None),
             ("training: 200/800 in 9 s, ETA 6 s\rstage 3 of 4 (training), about 2 min left\n", "training (3 of 4)", 25),
+            ("training: 400/800 in 9 s, ETA 6 s\n" * 1000, "training (3 of 4)", 50),
         ):
             with log.open("a") as file:
                 file.write(more)

@@ -48,7 +48,6 @@ def ray_cluster() -> Iterator[Any]:
 
 
 def run_with(engine: str, root: Path, rows: list, fault: object = None, **options: object) -> dict[str, Any]:
-    """Run rows by an engine, with a fault meanwhile, and return the figure of each done row."""
     batch = Batch(root)
     batch.write_plan(rows)
     thread = threading.Thread(target=fault, daemon=True) if callable(fault) else None

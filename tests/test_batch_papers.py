@@ -79,13 +79,17 @@ def table(out: Path) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells}
 
 
-def test_a_short_table_goes_on_where_it_stopped(tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_table_goes_on_where_it_stopped(tmp_path: Path, scene: Scene, monkeypatch, capsys) -> None:
     ran, out, paper = rows_here(monkeypatch), tmp_path / "out", tmp_path / "paper.toml"
     paper.write_text(SMALL)
     given = people(tmp_path / "people", scene, partial(writers.write_insta, held_out=2), "ann", "bob", "eve")
     short = ("--steps", "4", "--face-model", "tiny", "--subjects", "1")
     assert batch(given, paper, out, *short) == 0
-    found = table(out)
+    found, told = table(out), capsys.readouterr().err
+    assert "0 rows: " not in told
+    stages = ("(import)", "(train the-method-4)", "(evaluate the-method-4)")
+    assert all(f"stage {number} of 3 {name}" in told for number, name in enumerate(stages, 1))
+    assert "the-method-4: scores its held-out frames" in told
     assert found[""] == ["PSNR", "paper", "Hours", "paper", "state"]
     assert found["Theirs"] == ["-", "30.10", "-", "9", "the paper's figures alone"]
     psnr, *others, state = found["The Method"]
@@ -210,8 +214,7 @@ def test_own_footage_is_captured_and_tracked(tmp_path: Path, monkeypatch: pytest
 
 
 def test_each_layout_has_its_own_split_protocol_and_tracking(tmp_path: Path, scene: Scene, monkeypatch) -> None:
-    ran = rows_here(monkeypatch, lambda words: 0)
-    scored = {}
+    ran, scored, first = rows_here(monkeypatch, lambda words: 0), {}, []
     for layout, write, paper in (
         ("nersemble", lambda folder, _: writers.write_nersemble(folder), "gaussian_avatars.toml"),
         ("nerface", writers.write_nerface, "headgas.toml"),
@@ -224,7 +227,9 @@ def test_each_layout_has_its_own_split_protocol_and_tracking(tmp_path: Path, sce
         words = [[word for word in step if "306" not in word] for step in ran]
         made = [step[1:] for step in words if step[0] in ("import", "track")]
         train, evaluate = words[-2:]
+        first += next(step[step.index("--method") + 1 :][:1] for step in words if step[0] == "train")
         scored[layout, paper] = [made, train[train.index("--split") + 1], evaluate[evaluate.index("--protocol") + 1]]
+    assert first == ["gaussian_avatars", "headgas", "mono_gaussian_avatar", "headgas"], "the paper's own method"
     plain = ["--out", "--resume"]
     assert scored == {
         ("nersemble", "gaussian_avatars.toml"): [
@@ -266,7 +271,10 @@ def test_files_that_a_table_needs_are_looked_at_before_any_work(tmp_path: Path, 
     given = ("batch", people, "--out", tmp_path / "out", "--paper")
     assert "nothere.toml: no such file; give a table" in complaint(capsys, *given, tmp_path / "nothere.toml")
     weights = (tmp_path / "paper.toml", "--lpips-weights", tmp_path / "vgg.pth")
-    assert "vgg.pth: is not the file that torchvision published" in complaint(capsys, *given, *weights)
+    told = f"mien: --lpips-weights {tmp_path / 'vgg.pth'}: is not the file that torchvision published"
+    assert complaint(capsys, *given, *weights).startswith(told)
+    missing = complaint(capsys, *given, weights[0], "--capture.mattes", "nowhere")
+    assert missing.startswith("mien: --capture.mattes nowhere: no such file")
     assert not ran
     assert [row.name for row in read_table(people, [])] == ["ann", "ben"]
 

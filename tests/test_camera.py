@@ -258,7 +258,6 @@ def test_every_reading_is_named_in_any_world(marks: Tensor, rig: str, world: str
 
 
 def told_of(cameras: list[Camera], pixels: np.ndarray, capsys) -> str:
-    """Return the warning about a calibration."""
     ranking.warn_of_misfit(ranking.rank_readings(pixels, ranking.readings_of(cameras)))
     return capsys.readouterr().err
 

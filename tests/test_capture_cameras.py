@@ -70,7 +70,6 @@ def rig(test_data, tmp_path_factory):
 
 
 def capture_changed(rig, folder: Path, change: Callable[[list[dict]], list[dict]], **settings) -> Capture:
-    """Capture with a changed calibration."""
     write_rig(folder / "rig.json", *change(json.loads(rig[1].read_text())["cameras"]))
     out = folder / "out" / "capture"
     return capture_cameras([rig[0]], folder / "rig.json", out, "s", replace(SMALL, **settings))

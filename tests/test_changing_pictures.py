@@ -237,7 +237,6 @@ def pattern() -> np.ndarray:
 
 
 def read_twice(path: Path, mode: Deinterlace = "never") -> list[list[LazyFrame]]:
-    """Return the frames as they are read by default, and in another mode."""
     return [list(read_lazily(path)), list(read_lazily(path, mode=mode))]
 
 

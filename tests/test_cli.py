@@ -32,7 +32,6 @@ Told = pytest.CaptureFixture[str]
 
 
 def help_of(capsys: Told, *arguments: str) -> str:
-    """Ask for help, and return it."""
     with pytest.raises(SystemExit, match="^0$"):
         main(arguments)
     return capsys.readouterr().out
@@ -51,8 +50,10 @@ def test_help_shows_no_line_breaks_of_the_source_and_no_empty_defaults(name: str
     assert f"usage: mien {name}" in shown
     assert "default: None)" not in shown
     assert "default: )" not in shown
-    assert main(["--help"]) == 0
-    assert f"  {name} " in capsys.readouterr().out
+    assert main(["--help"]) == main(["batch-row", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert f"  {name} " in shown
+    assert "usage: mien batch-row DIR" in shown
 
 
 def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
@@ -72,7 +73,7 @@ def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
     ("train here --training.step 3", ("Unrecognized options: --training.step",)),
     ("create a.mp4 --method headgas --step 3 --out here", ("Unrecognized options: --step, 3",)),
     ("create a.mp4 --out b --tracking.paper.start 3", ("`mien track` has all options of tracking", "see mien create")),
-    ("batch-row --help", ("which `mien batch` starts",)),
+    ("batch-row", ("which `mien batch` starts",)),
     ("render here --out a.mp4 --siez 3", ("--siez", "Perhaps you meant: --size INT; see mien render --help",)),
     ("create", ("--out DIR", "see mien create --help")),
     ("render DIR --out a.png --set jawOpen=1 --set=eyeBlinkLeft=1", ("--set is given twice",)),

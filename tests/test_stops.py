@@ -32,7 +32,6 @@ of_every_kind = pytest.mark.parametrize("number", KINDS)
 
 
 def orderly(number: signal.Signals, work: Callable[[], object]) -> None:
-    """Do work that a signal stops."""
     with pytest.raises(KINDS[number]), orderly_stops():
         work()
 

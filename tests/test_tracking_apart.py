@@ -47,7 +47,6 @@ SCHEDULES = {"landmarks": LANDMARKS, "fast": FAST, "paper": PAPER, "paper from l
 
 
 def part_of(case: PhotometricCase, frames: slice, name: str) -> PhotometricCase:
-    """Return some frames of a case as one of their own."""
     arrays = ("timestamps", "images", "mattes", "landmarks", "valid")
     capture = replace(case.capture, name=name, **{key: getattr(case.capture, key)[frames] for key in arrays})
     return replace(case, face=case.face[frames], landmarks=case.landmarks[frames], capture=capture)

@@ -40,7 +40,6 @@ def studio(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Studio:
 
 
 def commands_that_write(studio: Studio, folder: Path) -> list[tuple[Path, str]]:
-    """Return command lines, each with the place that it writes."""
     root, video, runs = studio.root, studio.video, studio.root / "runs"
     clip, cache = root / "sequences/clip", Path(os.environ["MIEN_CACHE"])
     capture, create = " ".join(studio.capture_options), " ".join(studio.create_options)

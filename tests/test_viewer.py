@@ -22,7 +22,6 @@ from shared_things import MadeOnce, toy_workspace
 from web_case import drawn_head, faces_of, motion_of
 
 NAMES = load_face_model("anny").expression_names
-BOUNDS = load_face_model("anny").expression_bounds.numpy()
 
 avatar = pytest.fixture(scope="module")(lambda: runtime.Avatar(drawn_head(1000)))
 

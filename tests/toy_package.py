@@ -10,7 +10,6 @@ _PAGE = Path(__file__).parents[1] / "CONTRIBUTING.md"
 
 
 def blocks(recipe: str, language: str) -> list[str]:
-    """Return the blocks of code of a recipe ("Add a format") in a language."""
     section = _PAGE.read_text(encoding="utf-8").split(f"\n## {recipe}\n")[1].split("\n## ")[0]
     return re.findall(rf"^```{language}\n(.*?)^```", section, flags=re.MULTILINE | re.DOTALL)
 

@@ -37,20 +37,7 @@ def interpolate_mesh(
     face_index: Tensor, barycentric: Tensor, attributes: Tensor, corners: Tensor, out: Tensor
 ) -> None: ...
 
-# Gradients of points and light are float64. All gradients are added to, except those of barycentrics, uv and images,
-# which are written.
-def barycentric_backward(
-    fragments: Fragments, points: Tensor, faces: Tensor, grad_barycentric: Tensor, grad_points: Tensor
-) -> None: ...
-def interpolate_mesh_backward(
-    face_index: Tensor,
-    barycentric: Tensor,
-    attributes: Tensor,
-    corners: Tensor,
-    grad_out: Tensor,
-    grad_attributes: Tensor | None,
-    grad_barycentric: Tensor | None,
-) -> None: ...
+# Gradients of points and light are float64. All gradients are added to, but those of uv and images, which are written.
 def sample_texture(texture: Tensor, uv: Tensor, out: Tensor) -> None: ...
 def sample_texture_backward(
     texture: Tensor, uv: Tensor, grad_out: Tensor, grad_texture: Tensor | None, grad_uv: Tensor | None

@@ -125,6 +125,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     name, rest = arguments[0], arguments[1:]
     if name == _ROW:
+        if {"-h", "--help"} & {*rest}:
+            show(f"usage: mien {_ROW} DIR\n\nRun the row that standard input holds. `mien batch` starts this.")
+            return 0
         if len(rest) != 1 or rest[0].startswith("-"):
             raise UserError(f"`mien {_ROW}` is the process of a row, which `mien batch` starts; start that")
         from mien.batch.row import do_steps, row_process

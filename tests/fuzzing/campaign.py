@@ -175,7 +175,6 @@ def _run_in_a_row(tell: Callable[[Result], None], cases: list[str], bench: Bench
 
 
 def _ended(case: str, bench: Bench, before: dict[str, Any], finding: str, code: int) -> Result:
-    """Return the result of a case that ended its process."""
     told = bench.told.read_text(errors="replace")[-4000:] if bench.told.exists() else ""
     lines = [line.strip() for line in told.splitlines() if line.strip()]
     frames = [line.rpartition("/")[2] for line in lines if line.startswith('File "') and "/mien/" in line]

@@ -72,7 +72,6 @@ class Call:
         return bool(self.rng.random() < share)
 
     def maybe(self, value: Any, share: float = 0.5) -> Any:
-        """Return the value, or None."""
         return value if self.flag(share) else None
 
     def picture(self) -> tuple[int, int]:
@@ -307,7 +306,6 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "antialias_backward": lambda c: c.given(*with_edges(c), "H W d", "H W d", "=H W d", "=V 3:f8"),
     "bake_texture": lambda c: sighting(
         c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")),
-    "barycentric_backward": lambda c: c.given(*fragments(c), "H W 3", "=V 3:f8"),
     "box_of_nonzero": lambda c: [np.maximum(c.array("H W") - 2, 0)],
     "clear_rows": lambda c: [c.array("<2 n:u1"), c.given("n", "n 3", "n 2 4")],
     "compose_rigid": lambda c: c.given("4 4", "4 4", "=4 4"),
@@ -323,7 +321,6 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "head_poses": lambda c: c.given("n 3", "n 3", "=n 4 4"),
     "head_poses_backward": lambda c: c.given("n 3", "n 4 4", "=n 3"),
     "interpolate_mesh": lambda c: c.given(*drawn(c), "V c", "<V t 3", "=H W c"),
-    "interpolate_mesh_backward": lambda c: c.given(*drawn(c), "V c", "<V t 3", "H W c", "=V c", "=H W 3"),
     "keep_on_surface": lambda c: c.given("<r n", "r 5", 1.6, "n 3", "n 4", "n 3", "?r 4", "n 3"),
     "light_equations": lambda c: sighting(c, "=3 9 9:f8", "=3 9:f8"),
     "make_face_activations": lambda c: c.given(*face_activations(c)),

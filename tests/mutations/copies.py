@@ -42,7 +42,6 @@ class Case:
 
 
 def read_cases() -> list[Case]:
-    """Read all mutations."""
     content = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
     return [Case(**entry) for entry in content["case"]]
 

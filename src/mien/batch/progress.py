@@ -67,8 +67,11 @@ def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
 
 def _stage(batch: Batch, state: State) -> dict[str, Any]:
     """The stage that a running row is in, and the percentage of its present part, from its log."""
-    stage = percent = None
-    for line in tail(batch.log_file(state.name)).replace("\r", "\n").splitlines():
+    stage, percent, text = None, None, ""
+    for most in (1 << 13, 1 << 17, 1 << 22):  # hours of lines may follow that of a stage
+        if not _STAGE.search(text):
+            text = tail(batch.log_file(state.name), most=most)
+    for line in text.replace("\r", "\n").splitlines():
         if named := _STAGE.search(line):
             words = f"{named[3]} ({named[1]} of {named[2]})"
             stage, percent = words, percent if words == stage else None

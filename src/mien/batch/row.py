@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any
 
@@ -169,11 +170,11 @@ def last_error(log: Path, since: int = 0) -> str:
     return printable((errors or lines or [""])[-1])[:500]
 
 
-def tail(log: Path, since: int = 0) -> str:
-    """The end of a log, without its first `since` bytes. Empty if it cannot be read."""
+def tail(log: Path, since: int = 0, most: int = 8192) -> str:
+    """The last `most` bytes of a log, without its first `since` bytes. Empty if it cannot be read."""
     try:
         with open_to_read(log) as file:
-            file.seek(max(since, file.seek(0, os.SEEK_END) - 8192))
+            file.seek(max(since, file.seek(0, os.SEEK_END) - most))
             return file.read().decode("utf-8", "replace")
     except (OSError, UserError):
         return ""
@@ -212,7 +213,10 @@ def do_steps(main: Main, batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], 
     """Run the steps of a row with `main`, as `Do` does."""
     workspace = batch.workspace(row.name)
     stages: defaultdict[str, float] = defaultdict(float)
-    for step in row.steps:
+    for number, step in enumerate(row.steps, 1):
+        if step[0] != "create":  # which tells of stages of its own
+            named = [f" {word}" for flag, word in pairwise(step) if flag in ("--run", "--method")][:1]
+            tell(f"stage {number} of {len(row.steps)} ({''.join([step[0], *named])})")
         words = [fetched(word, batch.place("inputs")) for word in batch.words(row, step)]
         ended = threading.Event()
         sampler = threading.Thread(target=_sample, args=(step[0], stages, ended), daemon=True)

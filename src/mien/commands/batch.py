@@ -31,6 +31,10 @@ class Run:
     --preset draft, count for all rows; a cell of the table goes first.
 
     mien batch status DIR: how far each row is, what failed and why, and when it will be done.
+
+    mien batch PEOPLE --paper examples/papers/headgas.toml --out DIR: a paper's table, with our figures beside its own.
+    PEOPLE is a folder with a video, or a dataset's folder, for each subject. Each method of the file is trained on each
+    subject with the paper's settings and scored, which takes days. --subjects 1 --steps 300 --preset draft is a trial.
     """
 
     takes_more: ClassVar[bool] = True
@@ -39,8 +43,9 @@ class Run:
     out: Path
     """Folder of the batch, new or existing."""
     paper: Path | None = None
-    """A table of a paper (examples/papers/NAME.toml), which says what is trained and how it is scored. table.md then
-    has our means over subjects beside the paper's figures."""
+    """A file that describes a paper's table: its methods, their settings, how they are scored, and the paper's figures
+    (examples/papers/NAME.toml). DIR/table.md has the result, with our means over subjects. Options of `mien import`,
+    `capture`, `track`, `train` and `evaluate` replace those of the file; --lpips-weights FILE is needed for LPIPS."""
     subjects: Annotated[int, _COUNT] = 0
     """Use only the first so many subjects. 0 means all."""
     on: Literal["local", "slurm", "ray"] = "local"
@@ -117,7 +122,7 @@ class Run:
             self.on, self.jobs, self.threads, *cluster, retry=self.retry, store=self.store, program=self._program()
         )
         chosen = shard_of(rows, self.shard) if self.shard else rows
-        for some in ([row for row in chosen if row.first], [row for row in chosen if not row.first]):
+        for some in filter(None, ([row for row in chosen if row.first], [row for row in chosen if not row.first])):
             drive(batch, some, options)
         write_wall(batch, results := write_results(batch))
         write_table(batch, results, paper)

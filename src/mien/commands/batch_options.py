@@ -82,7 +82,7 @@ def check_steps(steps: Sequence[Sequence[str]], where: str, kinds: set[str]) -> 
             if name in ("capture", "track"):
                 command.settings.check()
             if name == "evaluate" and command.lpips_weights is not None:
-                _check_lpips(command.lpips_weights)
+                check_lpips(command.lpips_weights)
             if name == "create":
                 command.capture.check()
                 command.tracking.check()
@@ -90,7 +90,7 @@ def check_steps(steps: Sequence[Sequence[str]], where: str, kinds: set[str]) -> 
             raise UserError(f"{where}: {error}") from None
 
 
-def _check_lpips(weights: Path) -> None:
+def check_lpips(weights: Path) -> None:
     """Check that LPIPS can be made of a file, so that no row is trained in vain."""
     from mien.perceptual.lpips import load_lpips
 

@@ -95,7 +95,7 @@ def _person(entry: Entry) -> Person:
 def _steps(person: Person, paper: Paper, given: Words, drivers: list[str]) -> list[list[str]]:
     """The commands of a subject's row. `given` has options that precede those of the paper."""
     steps = making_steps(person, paper, given)
-    for line in (line for line in paper.rows if line.method):
+    for line in (line for line in reversed(paper.rows) if line.method):  # a paper's own method is its last row
         options = _options(person, paper, line, given)
         steps.append(["train", WORKSPACE, "--run", line.run, "--method", line.method, *_typed("train", options)])
         scored = ["--resume", "--no-perceptual", *_typed("evaluate", options)]

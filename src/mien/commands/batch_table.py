@@ -18,6 +18,7 @@ from mien.commands.batch_options import (
     OF_SCORES,
     OPTIONS,
     PATHS,
+    check_lpips,
     check_steps,
     column_of,
     is_option,
@@ -117,6 +118,12 @@ def columns_of(words: Sequence[str]) -> dict[str, list[str]]:
             near = difflib.get_close_matches(column, sorted(OPTIONS), 1)
             hint = f"; did you mean --{near[0]}?" if near else ""
             raise UserError(f"unknown: --{column}{hint}; see mien batch --help, and mien create --help-all")
+        # A face model may be a name instead of a file.
+        for word in found if column in PATHS - {"face-model"} else ():
+            if not (is_url(word) or _exists(Path(word))):
+                raise UserError(f"--{column} {word}: no such file; correct the path")
+            if column == "lpips-weights":
+                check_lpips(Path(word))
         resolved = [str(Path(word).resolve()) if column in PATHS and _exists(Path(word)) else word for word in found]
         columns[column] = resolved or ["yes"]
     return columns

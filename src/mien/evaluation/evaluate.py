@@ -24,6 +24,7 @@ from mien.evaluation.report_sections import cross_section
 from mien.evaluation.run_report import RunRecord, write_report
 from mien.evaluation.scoring import worker_threads
 from mien.evaluation.videos import write_comparison_video, write_scored_pictures
+from mien.machine.progress import say
 from mien.perceptual.lpips import load_lpips
 from mien.training.colors import GAINS
 from mien.training.footage.filmed import read_coverage
@@ -62,6 +63,8 @@ def _evaluate(
             f"{run_dir}: no frame was held out, so nothing can be scored; train with `--split blocks` or "
             "`--split tail`, on 5 frames or more"
         )
+    if experiments:
+        say(f"{run_dir.name}: scores its held-out frames; the first takes longest")
     partials = {
         name: PartialScores(run_dir / f".{name}.partial", _fingerprint(run_dir, name, experiment, settings))
         for name, experiment in experiments.items()

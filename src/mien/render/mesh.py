@@ -82,7 +82,7 @@ def interpolate(
 ) -> Float[Tensor, "h w c"]:
     """Interpolate attributes of vertices, or of every triangle's corners, at each pixel; 0 if there is no triangle.
 
-    The result is differentiable in `attributes`, and in the barycentrics if these are (`differentiable_fragments`).
+    The result is not differentiable. `mesh_loss` has the gradients of a whole picture.
     """
     corners = faces
     if attributes.ndim == 3:
@@ -90,31 +90,10 @@ def interpolate(
         attributes = attributes.flatten(0, 1)
     if attributes.dtype != torch.float32:
         return interpolate_reference(fragments, attributes, corners)
-    rows = (attributes, fragments.barycentric, fragments.face_index, corners.contiguous())
-    return _Interpolate.apply(*rows)  # pyright: ignore[reportReturnType]
-
-
-class _Interpolate(torch.autograd.Function):
-    """Rows of attributes mixed by barycentrics."""
-
-    @staticmethod
-    def forward(ctx: Any, attributes: Tensor, barycentric: Tensor, face_index: Tensor, corners: Tensor):
-        attributes, barycentric = attributes.detach().contiguous(), barycentric.detach()
-        out = torch.empty(*face_index.shape, attributes.shape[1])
-        _native.interpolate_mesh(face_index, barycentric, attributes, corners, out)
-        ctx.save_for_backward(attributes, barycentric, face_index, corners)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor):
-        attributes, barycentric, face_index, corners = ctx.saved_tensors
-        grad_attributes = torch.zeros_like(attributes) if ctx.needs_input_grad[0] else None
-        grad_barycentric = torch.empty_like(barycentric) if ctx.needs_input_grad[1] else None
-        _native.interpolate_mesh_backward(
-            face_index, barycentric, attributes, corners, grad.contiguous(), grad_attributes, grad_barycentric
-        )
-        return grad_attributes, grad_barycentric, None, None
+    out = torch.empty(*fragments.face_index.shape, attributes.shape[1])
+    given = (attributes.detach().contiguous(), corners.contiguous(), out)
+    _native.interpolate_mesh(fragments.face_index, fragments.barycentric, *given)
+    return out
 
 
 def interpolate_reference(

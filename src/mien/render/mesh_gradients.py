@@ -1,11 +1,10 @@
 """Gradients of pictures of meshes with respect to the mesh: through the visible surface and through silhouettes.
 
-There are single operations (`image_points`, `differentiable_fragments`, `interpolate`, `sample_texture`, `antialias`)
-and one that combines them with light and a robust loss in a single pass (`mesh_loss`). They run on one thread, release
-the GIL, and are deterministic to the bit.
+There are single operations (`image_points`, `sample_texture`, `antialias`) and one that combines them with light and a
+robust loss in a single pass (`mesh_loss`). They run on one thread, release the GIL, and are deterministic to the bit.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -70,35 +69,6 @@ def mesh_edges(faces: Int[Tensor, "f 3"], used: Tensor | None = None) -> MeshEdg
 def image_points(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
     """World-space points as (x, y) in pixels times depth, and depth in metres. Differentiable, also in the camera."""
     return (vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
-
-
-def differentiable_fragments(
-    fragments: MeshFragments, points: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
-) -> MeshFragments:
-    """The same fragments with barycentrics that are differentiable in the image points.
-
-    Visibility and depth have no gradient, nor has a barycentric that was clamped at 0.
-    """
-    own = (fragments.barycentric, points, fragments.face_index, fragments.depth, faces)
-    return replace(fragments, barycentric=_Barycentrics.apply(*own))
-
-
-class _Barycentrics(torch.autograd.Function):
-    """The identity on barycentrics. The gradient goes to the image points that they were computed from."""
-
-    @staticmethod
-    def forward(ctx: Any, barycentric: Tensor, points: Tensor, face_index: Tensor, depth: Tensor, faces: Tensor):
-        ctx.save_for_backward(face_index, barycentric, depth, points.detach(), faces)
-        return barycentric.clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor):
-        face_index, barycentric, depth, points, faces = ctx.saved_tensors
-        grad_points = torch.zeros(points.shape, dtype=torch.float64)
-        fragments = _native.Fragments(face_index, barycentric, depth)
-        _native.barycentric_backward(fragments, points, faces, grad.contiguous(), grad_points)
-        return None, grad_points.float(), None, None, None
 
 
 def antialias(
