@@ -61,7 +61,7 @@ def rigid_gaussians(
     looked = ((motion > LEAST_MOTION) & ~left[surface.triangles().long()]).nonzero()[:, 0]
     if len(looked) < max(_NEAREST, _LEAST_COUNT):
         return looked[:0]
-    places = world_means(avatar.pose(still).gaussians)[0][looked].cpu().numpy()
+    places = world_means(avatar.pose(still).gaussians.timestep(0))[looked].cpu().numpy()
     around = torch.from_numpy(KDTree(places).query(places, k=_NEAREST)[1]).to(looked.device)
     rigid = looked[undone[looked][around].clamp(-1, 1).mean(1) > _UNDONE]
     return rigid if len(rigid) >= _LEAST_COUNT else rigid[:0]
