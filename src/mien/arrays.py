@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
+from importlib import import_module
 from typing import Any, TypeVar
 
 import torch
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mien import _native
+from mien.kernels import on_gpu
 
 _Operation = TypeVar("_Operation", bound=Callable[..., Any])
 
@@ -37,17 +39,20 @@ def is_native(*tensors: Tensor) -> bool:
     )
 
 
-def native(reference: Callable[..., Any]) -> Callable[[_Operation], _Operation]:
+def native(reference: Callable[..., Any], *, gpu: str | None = None) -> Callable[[_Operation], _Operation]:
     """Decorate an operation that calls the native core, so that `reference` computes what the core cannot take.
 
     Every native operation is dispatched in this way. `reference` is the same in plain PyTorch, for any dtype and
-    device, and takes the same arguments. The tensors among them decide, but not those inside of records.
+    device, and takes the same arguments. The tensors among them decide, but not those inside of records. `gpu` is the
+    module with a function of the operation's name that calls kernels of a GPU; it is imported at its first use.
     """
 
     def decorate(operation: _Operation) -> _Operation:
         @wraps(operation)
         def dispatch(*arguments: Any, **named: Any) -> Any:
-            tensors = (given for given in (*arguments, *named.values()) if isinstance(given, Tensor))
+            tensors = [given for given in (*arguments, *named.values()) if isinstance(given, Tensor)]
+            if gpu is not None and on_gpu(*tensors):
+                return getattr(import_module(gpu), operation.__name__)(*arguments, **named)
             return (operation if is_native(*tensors) else reference)(*arguments, **named)
 
         return dispatch  # pyright: ignore[reportReturnType]

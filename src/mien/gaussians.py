@@ -26,6 +26,9 @@ class Gaussians:
     """Real spherical-harmonics coefficients of the colour (k = 1, 4, 9 or 16) in the local frame."""
     T_world_local: Float[Tensor, "... 4 4"] | None = None
     """Rigid pose of the local frame; None means identity. Renderers move the camera by it, not the Gaussians."""
+    covariances: Float[Tensor, "... n 6"] | None = None
+    """What `quats` and `scales` say as xx, xy, xz, yy, yz and zz, in square metres. Kernels of a GPU pose these, and
+    the renderer there takes them. If they are given, gradients of shapes go through them alone."""
 
     def __len__(self) -> int:
         """The number of Gaussians, n."""
@@ -34,16 +37,17 @@ class Gaussians:
     @property
     def batched(self) -> bool:
         """Whether there is a leading axis of timesteps."""
-        return any(t.ndim > ndim for t, ndim in self._tensors_with_ndim())
+        return any(t is not None and t.ndim > ndim for t, ndim in self._tensors_with_ndim())
 
     def timestep(self, index: int) -> "Gaussians":
         """One entry of the batch axis; tensors without that axis are shared. Unbatched Gaussians return themselves."""
         if not self.batched:
             return self
-        names = ("means", "quats", "scales", "opacities", "sh", "T_world_local")
+        names = ("means", "quats", "scales", "opacities", "sh", "T_world_local", "covariances")
         picked = {
             name: _entry(tensor, index) if tensor.ndim > ndim else tensor
-            for name, (tensor, ndim) in zip(names, self._tensors_with_ndim(), strict=False)
+            for name, (tensor, ndim) in zip(names, self._tensors_with_ndim(), strict=True)
+            if tensor is not None
         }
         return Gaussians(**picked)
 
@@ -52,12 +56,13 @@ class Gaussians:
 
         The backward pass of all entries together is as fast as that of one: it fills each gradient once.
         """
-        lengths = {len(tensor) for tensor, ndim in self._tensors_with_ndim() if tensor.ndim > ndim}
+        known = self._tensors_with_ndim()
+        lengths = {len(tensor) for tensor, ndim in known if tensor is not None and tensor.ndim > ndim}
         if not lengths:
             return [self]
         (count,) = lengths
         columns = [
-            tensor.unbind() if tensor.ndim > ndim else [tensor] * count for tensor, ndim in self._tensors_with_ndim()
+            [tensor] * count if tensor is None or tensor.ndim == ndim else tensor.unbind() for tensor, ndim in known
         ]
         return [Gaussians(*entry) for entry in zip(*columns, strict=True)]
 
@@ -70,24 +75,21 @@ class Gaussians:
             scales=self.scales[..., mask, :],
             opacities=self.opacities[..., mask],
             sh=self.sh[..., mask, :, :],
+            covariances=None if self.covariances is None else self.covariances[..., mask, :],
         )
 
     def to(self, like: Tensor) -> "Gaussians":
         """These Gaussians with the dtype and device of `like`."""
-        pose = None if self.T_world_local is None else self.T_world_local.to(like)
-        moved = (t.to(like) for t in (self.means, self.quats, self.scales, self.opacities, self.sh))
-        return Gaussians(*moved, T_world_local=pose)
+        return Gaussians(*(None if one is None else one.to(like) for one, _ in self._tensors_with_ndim()))  # pyright: ignore
 
     def detach(self) -> "Gaussians":
         """The same values, cut from the autograd graph."""
-        pose = None if self.T_world_local is None else self.T_world_local.detach()
-        cut = (t.detach() for t in (self.means, self.quats, self.scales, self.opacities, self.sh))
-        return Gaussians(*cut, T_world_local=pose)
+        return Gaussians(*(None if one is None else one.detach() for one, _ in self._tensors_with_ndim()))  # pyright: ignore
 
-    def _tensors_with_ndim(self) -> list[tuple[Tensor, int]]:
-        """Each tensor that is not None, with its number of axes when unbatched, in the order of the fields."""
+    def _tensors_with_ndim(self) -> list[tuple[Tensor | None, int]]:
+        """Each tensor, with its number of axes when unbatched, in the order of the fields."""
         entries = [(self.means, 2), (self.quats, 2), (self.scales, 2), (self.opacities, 1), (self.sh, 3)]
-        return entries if self.T_world_local is None else [*entries, (self.T_world_local, 2)]
+        return [*entries, (self.T_world_local, 2), (self.covariances, 2)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +114,9 @@ def stack_timesteps(timesteps: Sequence[Gaussians]) -> Gaussians:
     names = ("means", "quats", "scales", "opacities", "sh")
     single = [gaussians.timestep(0) for gaussians in timesteps]
     poses = [gaussians.T_world_local for gaussians in single if gaussians.T_world_local is not None]
+    shapes = [gaussians.covariances for gaussians in single if gaussians.covariances is not None]
     stacked = (torch.stack([getattr(gaussians, name) for gaussians in single]) for name in names)
-    return Gaussians(*stacked, T_world_local=torch.stack(poses) if poses else None)
+    return Gaussians(*stacked, *(torch.stack(own) if own else None for own in (poses, shapes)))
 
 
 def _entry(tensor: Tensor, index: int) -> Tensor:

@@ -129,6 +129,8 @@ class _ComposeRigid(torch.autograd.Function):
             out = recycled_like(first)
             _native.compose_rigid(*unpacked(first, second, out))
             return out
+        if first.device.type != "cpu":
+            return first @ second
         one, two, three, four = (first[:, :, None] * second).unbind(1)
         return ((one + two) + three) + four
 
@@ -140,9 +142,8 @@ class _ComposeRigid(torch.autograd.Function):
         if first.dtype == torch.float32 and first.device.type == "cpu":
             by_first, by_second = recycled_like(first), recycled_like(second)
             _native.compose_rigid_backward(*unpacked(first, second, gradient.contiguous(), by_first, by_second))
-        else:
-            by_first, by_second = gradient @ second.T, first.T @ gradient
-        return by_first if of_first else None, by_second if of_second else None
+            return by_first if of_first else None, by_second if of_second else None
+        return gradient @ second.T if of_first else None, first.T @ gradient if of_second else None
 
 
 def invert_rigid(transforms: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:

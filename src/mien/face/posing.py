@@ -1,6 +1,6 @@
 """Native computation of vertices and head poses: autograd around the C++ core, for float32 on a CPU."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 from weakref import WeakKeyDictionary
 
 import torch
@@ -29,7 +29,7 @@ def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
 def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float[Tensor, "b v 3"]:
     """Compute `FaceModel.__call__` (in world space) or `FaceModel.head_vertices`, differentiable in all fields."""
     compiled = compiled_model(model)
-    rest, joint_rest = compiled.rest_shape(model, face)
+    rest, joint_rest = compiled.rest.of(model, face)
     head = (face.head_rotation, face.head_translation) if in_world else (None, None)
     return _PoseVertices.apply(compiled.data, rest, joint_rest, face.expression, face.joints, *head)
 
@@ -64,7 +64,7 @@ class _HeadPoses(torch.autograd.Function):
 
 
 class CompiledModel:
-    """A model's constants in the core's layout, and the last person's shape, which training needs in every step."""
+    """A model's constants in the core's layout, and the last person's shape."""
 
     def __init__(self, model: "FaceModel"):
         pose_basis = model.pose_basis
@@ -77,9 +77,17 @@ class CompiledModel:
             parents=model.joint_parents,
             is_free=model.joint_free,
         )
+        self.rest = RestShape()
+
+
+@final
+class RestShape:
+    """The last person's shape without expression, which training needs in every step."""
+
+    def __init__(self):
         self._last: tuple[Any, ...] | None = None
 
-    def rest_shape(self, model: "FaceModel", face: FaceParams) -> tuple[Tensor, Tensor]:
+    def of(self, model: "FaceModel", face: FaceParams) -> tuple[Tensor, Tensor]:
         """Return vertices and joints of this person without expression."""
         identity, offsets = face.identity, face.vertex_offsets
         versions = (identity._version, None if offsets is None else offsets._version)

@@ -90,28 +90,36 @@ class Adam:
 
 def update_all(updates: Sequence[Update]) -> None:
     """Apply all updates in place: natively if tensors are float32, contiguous and on a CPU, with mien's `EPSILON`."""
-    tasks = []
+    tasks, others = [], []
     for update in updates:
         values, gradient, moments, rate, epsilon = update
         arrays = (values, gradient, moments.first, moments.second, moments.step)
         if epsilon == EPSILON and _fit_core(arrays):
             tasks.append((*unpacked(*arrays), rate))
         else:
-            update_reference(update)
+            others.append(update)
     if tasks:
         _native.adam_update(tasks)
+    if others:
+        update_reference(*others)
 
 
 @torch.no_grad()
-def update_reference(update: Update) -> None:
-    """One update in plain PyTorch."""
-    values, gradient, moments, rate, epsilon = update
-    moments.step += 1
-    step = float(moments.step)
-    moments.first.lerp_(gradient, 1 - BETA1)
-    moments.second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    denominator = moments.second.sqrt().mul_(1 / math.sqrt(1 - BETA2**step)).add_(epsilon)
-    values.addcdiv_(moments.first, denominator, value=-rate / (1 - BETA1**step))
+def update_reference(*updates: Update) -> None:
+    """Updates in plain PyTorch. Each operation takes all tensors at once, which are few launches on a GPU."""
+    values, gradients, states, rates, epsilons = map(list, zip(*updates, strict=True))
+    first, second = [moments.first for moments in states], [moments.second for moments in states]
+    for moments in states:
+        moments.step += 1
+    steps = [float(moments.step) for moments in states]
+    torch._foreach_lerp_(first, gradients, 1 - BETA1)
+    torch._foreach_mul_(second, BETA2)
+    torch._foreach_addcmul_(second, gradients, gradients, 1 - BETA2)
+    denominators = torch._foreach_sqrt(second)
+    torch._foreach_mul_(denominators, [1 / math.sqrt(1 - BETA2**step) for step in steps])
+    torch._foreach_add_(denominators, epsilons)
+    shares = [-rate / (1 - BETA1**step) for rate, step in zip(rates, steps, strict=True)]
+    torch._foreach_addcdiv_(values, first, denominators, shares)
 
 
 def _fit_core(tensors: Iterable[Tensor]) -> bool:

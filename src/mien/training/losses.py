@@ -19,6 +19,7 @@ from mien.arrays import is_native, native, recycled, recycled_like, times, unpac
 from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.camera import Box
 from mien.gaussians import Rendering
+from mien.kernels import on_gpu
 from mien.perceptual.features import TrainingFeatures, load_training_features
 from mien.training.footage.sequence import Target
 
@@ -51,6 +52,11 @@ def photometric_loss(
     """
     assert image.shape == target.shape, (image.shape, target.shape)
     assert not target.requires_grad
+    if on_gpu(image, target):
+        from mien.training.losses_gpu import photometric_loss as on_device
+
+        own = [clipped for part in parts if part_weight > 0 and min((clipped := _clipped(part, image))[2:]) > 0]
+        return on_device(image, target, (l1_weight, ssim_weight), _clipped(box, image), own, part_weight)
     if not is_native(image, target) or image.shape[1] < _NATIVE_MIN_WIDTH:
         return photometric_loss_reference(
             image, target, l1_weight, ssim_weight, box if drawn is None else None, parts, part_weight
@@ -187,7 +193,7 @@ def alpha_loss_reference(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"
     return weight * (alpha - matte.to(alpha) / 255).abs().mean()
 
 
-@native(alpha_loss_reference)
+@native(alpha_loss_reference, gpu="mien.training.losses_gpu")
 def alpha_loss(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Float[Tensor, ""]:
     """`weight` times the mean absolute difference between alpha and a matte (0..255). Native for float32 on a CPU."""
     return _AlphaLoss.apply(alpha, matte, weight)  # pyright: ignore[reportReturnType]

@@ -1,5 +1,6 @@
 """Bound Gaussians: posing of the face, frames of the triangles and opacities as one operation."""
 
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import compiled_model, has_native_posing, head_poses
 from mien.gaussians import Gaussians
+from mien.kernels import on_gpu
 
 LOCAL = ("means", "quats", "log_scales", "opacity_logits")
 """Names of the tensors of Gaussians in the frames of their triangles."""
@@ -39,10 +41,20 @@ def pose_bound_gaussians(
     """
     prepared = prepare_posing(face_model, face, store)
     if prepared is None:
-        return pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
+        posed = _posed_on_gpu(face_model, face, store, sh, in_head)
+        return posed or pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
     data, topology, inputs = prepared
     means, quats, scales, opacities, *head = _BoundGaussians.apply(data, topology, in_head, *inputs)
     return Gaussians(means, quats, scales, opacities, sh, *head)
+
+
+def _posed_on_gpu(
+    face_model: FaceModel, face: FaceParams, store: Tensors, sh: Float[Tensor, "n k 3"], in_head: bool
+) -> Gaussians | None:
+    """The posed Gaussians of one timestep by kernels of a GPU, or None if these cannot pose them."""
+    if len(face) != 1 or not on_gpu(face_model.template, store["means"], *face.tensors().values()):
+        return None
+    return import_module(f"{__name__}_gpu").pose_bound_gaussians(face_model, face, store, sh, in_head)
 
 
 def prepare_posing(

@@ -29,7 +29,7 @@ def triangle_penalties_reference(
     return weights[0] * (too_far * share).sum(), weights[1] * (too_large * share).sum()
 
 
-@native(triangle_penalties_reference)
+@native(triangle_penalties_reference, gpu="mien.avatar.ops.triangle_penalties_gpu")
 def triangle_penalties(
     means: Float[Tensor, "n 3"],
     log_scales: Float[Tensor, "n 3"],

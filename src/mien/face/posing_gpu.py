@@ -1,0 +1,309 @@
+"""Posing of one timestep of a face in kernels for a GPU: four launches forward and four backward.
+
+One program moves the joints: its lanes are the joints, and one more, which is the head in the world. Products with the
+face model's bases and skinning weights are matrix products.
+"""
+
+from typing import TYPE_CHECKING, Any, no_type_check
+from weakref import WeakKeyDictionary
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mien.face.params import FaceParams
+from mien.face.posing import RestShape
+from mien.kernels import blocks, launch
+
+if TYPE_CHECKING:
+    from mien.face.model import FaceModel
+
+_BLOCK = 128
+
+
+def pose_face(model: "FaceModel", face: FaceParams, in_world: bool) -> tuple[Tensor, Tensor] | None:
+    """Vertices [1, v, 3] in the world or in the head frame, and the head's pose [1, 4, 4].
+
+    They are differentiable in what changes from timestep to timestep. None if the person's shape has a gradient.
+    """
+    constants = _constants(model)
+    rest, joints = constants.rest.of(model, face)
+    if rest.requires_grad or joints.requires_grad:
+        return None
+    motion = (face.expression, face.joints, face.head_rotation, face.head_translation)
+    return _Pose.apply(constants, in_world, rest, joints, *motion)  # pyright: ignore[reportReturnType]
+
+
+class _Constants:
+    """A face model as the kernels take it."""
+
+    def __init__(self, model: "FaceModel"):
+        self.rest = RestShape()
+        bases = [model.expression_basis] if model.pose_basis is None else [model.expression_basis, model.pose_basis]
+        self.basis = torch.cat(bases).flatten(1).contiguous()
+        self.weights = model.skinning_weights.contiguous()
+        self.turns, self.shifts = model.joint_rotation_basis.contiguous(), model.joint_translation_basis.contiguous()
+        free = iter(range(len(model.joint_free)))
+        places = [next(free) if one else -1 for one in model.joint_free]
+        like = model.template.device
+        self.parents = torch.tensor([*model.joint_parents, -1], dtype=torch.int32).to(like)
+        self.free = torch.tensor(places, dtype=torch.int32).to(like)
+
+
+def _constants(model: "FaceModel") -> _Constants:
+    known = _known.get(model)
+    if known is None:
+        known = _known[model] = _Constants(model)
+    return known
+
+
+_known: "WeakKeyDictionary[FaceModel, _Constants]" = WeakKeyDictionary()
+
+
+class _Pose(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, own: _Constants, in_world: bool, *given: Tensor) -> tuple[Tensor, Tensor]:
+        rest, joint_rest, *motion = (tensor.contiguous() for tensor in given)
+        k, e, v = len(joint_rest), motion[0].shape[1], len(rest)
+        local, transforms, factors = rest.new_empty(k + 1, 12), rest.new_empty(k + 1, 12), rest.new_empty(len(own.basis))
+        pose, vertices, shaped = rest.new_empty(1, 4, 4), rest.new_empty(1, v, 3), rest.new_empty(v, 3)
+        joints = (*motion, joint_rest, own.turns, own.shifts, own.parents, own.free, k, e)
+        sizes = {
+            "IN_WORLD": in_world, "CORRECTED": len(own.basis) > e,
+            "JOINTS": triton.next_power_of_2(k + 1), "EXPRESSIONS": triton.next_power_of_2(max(e, 1)),
+        }  # fmt: skip
+        launch(_move_joints, 1, *joints, local, transforms, factors, pose, **sizes)
+        moved, blended = torch.mv(own.basis.T, factors), torch.mm(own.weights, transforms[:k])
+        launch(_skin, blocks(v, _BLOCK), rest, moved, blended, shaped, vertices, v, BLOCK=_BLOCK)
+        ctx.own, ctx.joints, ctx.sizes = own, joints[4:], sizes
+        ctx.save_for_backward(*motion, local, transforms, shaped, blended)
+        return vertices, pose
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_vertices: Tensor, by_pose: Tensor) -> tuple[Tensor | None, ...]:
+        *motion, local, transforms, shaped, blended = ctx.saved_tensors
+        own, v, k = ctx.own, len(shaped), len(local) - 1
+        by_shaped, outer = torch.empty_like(shaped), torch.empty_like(blended)
+        by_vertices = by_vertices.contiguous()
+        launch(_skin_backward, blocks(v, _BLOCK), by_vertices, blended, shaped, by_shaped, outer, v, BLOCK=_BLOCK)
+        by_factors, by_joints = torch.mv(own.basis, by_shaped.view(-1)), torch.mm(own.weights.T, outer)
+        results = [torch.empty_like(tensor) for tensor in motion]
+        scratch = torch.empty_like(local), torch.empty_like(local)
+        launch(
+            _move_joints_backward, 1, *motion, *ctx.joints, local, transforms, by_joints, by_pose.contiguous(),
+            by_factors, *scratch, *results, **ctx.sizes,
+        )  # fmt: skip
+        return None, None, None, None, *results
+
+
+@no_type_check
+@triton.jit
+def _skin(rest, moved, blended, shaped, vertices, v, BLOCK: tl.constexpr):
+    row, axis = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4)
+    at, there = 3 * row[:, None] + axis[None, :], (row < v)[:, None] & (axis < 3)[None, :]
+    own = tl.load(rest + at, mask=there, other=0.0) + tl.load(moved + at, mask=there, other=0.0)
+    tl.store(shaped + at, own, mask=there)
+    point = tl.where((axis == 3)[None, :], 1.0, own)
+    for i in tl.static_range(3):
+        of_row = tl.load(blended + 12 * row[:, None] + 4 * i + axis[None, :], mask=(row < v)[:, None], other=0.0)
+        tl.store(vertices + 3 * row + i, tl.sum(of_row * point, 1), mask=row < v)
+
+
+@no_type_check
+@triton.jit
+def _skin_backward(by_vertices, blended, shaped, by_shaped, outer, v, BLOCK: tl.constexpr):
+    row, axis = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4)
+    at, there = 3 * row[:, None] + axis[None, :], (row < v)[:, None] & (axis < 3)[None, :]
+    point = tl.where((axis == 3)[None, :], 1.0, tl.load(shaped + at, mask=there, other=0.0))
+    result = point * 0.0
+    for i in tl.static_range(3):
+        at_row, known = 12 * row[:, None] + 4 * i + axis[None, :], (row < v)[:, None]
+        gradient = tl.load(by_vertices + 3 * row + i, mask=row < v, other=0.0)[:, None]
+        result += gradient * tl.load(blended + at_row, mask=known, other=0.0)
+        tl.store(outer + at_row, gradient * point, mask=known)
+    tl.store(by_shaped + at, result, mask=there)
+
+
+@no_type_check
+@triton.jit
+def _turn(
+    axis: tl.constexpr, expression, joints, head, turns, free, k, e, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr
+):
+    """One number of each joint's axis-angle vector, and of the head's in the last lane."""
+    joint = tl.arange(0, JOINTS)
+    place = tl.load(free + joint, mask=joint < k, other=-1)
+    given = tl.load(joints + 3 * place + axis, mask=place >= 0, other=0.0)
+    derived = _derived(axis, expression, turns, k, e, JOINTS, EXPRESSIONS)
+    return tl.where(joint == k, tl.load(head + axis), tl.where(place >= 0, given, derived))
+
+
+@no_type_check
+@triton.jit
+def _derived(axis: tl.constexpr, expression, basis, k, e, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr):
+    """What the expression says of one number of each joint."""
+    joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
+    at, there = (number[:, None] * k + joint[None, :]) * 3 + axis, (number < e)[:, None] & (joint < k)[None, :]
+    own = tl.load(expression + number, mask=number < e, other=0.0)
+    return tl.sum(own[:, None] * tl.load(basis + at, mask=there, other=0.0), 0)
+
+
+@no_type_check
+@triton.jit
+def _factors(x, y, z):
+    """sin a / a, (1 - cos a) / a^2 and cos a of the angle a, and derivatives of the first two, divided by a."""
+    squared = x * x + y * y + z * z
+    small = squared < 1e-8
+    safe = tl.where(small, 1.0, squared)
+    angle = tl.sqrt(safe)
+    sine = tl.where(small, 1 - squared / 6, tl.sin(angle) / angle)
+    cosine = tl.where(small, 0.5 - squared / 24, (1 - tl.cos(angle)) / safe)
+    straight = 1 - cosine * squared
+    by_sine = tl.where(small, -1.0 / 3, (straight - sine) / safe)
+    by_cosine = tl.where(small, -1.0 / 12, (sine - 2 * cosine) / safe)
+    return sine, cosine, straight, by_sine, by_cosine
+
+
+@no_type_check
+@triton.jit
+def _parent(parents, index, k, IN_WORLD: tl.constexpr):
+    """The joint that a joint moves with, or -1. In the world, all move with the head's lane, the last."""
+    parent = tl.load(parents + index)
+    if IN_WORLD:
+        parent = tl.where((parent < 0) & (index < k), k, parent)
+    return parent
+
+
+@no_type_check
+@triton.jit
+def _of_parent(transforms, parent, row, middle):
+    """The transform of a parent, or the identity, as [4, 4, 1]; the last row is not used."""
+    known = tl.load(transforms + 12 * parent + 4 * row + middle, mask=(row < 3) & (parent >= 0), other=0.0)
+    return tl.where(parent >= 0, known, tl.where(row == middle, 1.0, 0.0))
+
+
+@no_type_check
+@triton.jit
+def _homogeneous(local, index, middle, column):
+    known = tl.load(local + 12 * index + 4 * middle + column, mask=middle < 3, other=0.0)
+    return tl.where((middle == 3) & (column == 3), 1.0, known)
+
+
+@no_type_check
+@triton.jit
+def _move_joints(
+    expression, joints, rotation, translation, joint_rest, turns, shifts, parents, free, k, e, local, transforms,
+    factors, pose, IN_WORLD: tl.constexpr, CORRECTED: tl.constexpr, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr,
+):  # fmt: skip
+    joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
+    there, place = joint <= k, tl.load(free + joint, mask=joint < k, other=-1)
+    x = _turn(0, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
+    y = _turn(1, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
+    z = _turn(2, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
+    sine, cosine, straight, _, _ = _factors(x, y, z)
+    vector, cross = (x, y, z), ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    for i in tl.static_range(3):
+        rest = tl.load(joint_rest + 3 * joint + i, mask=joint < k, other=0.0)
+        about = rest + _derived(i, expression, shifts, k, e, JOINTS, EXPRESSIONS)
+        about += tl.where(joint == k, tl.load(translation + i), 0.0)
+        for j in tl.static_range(3):
+            turned = sine * cross[i][j] + cosine * vector[i] * vector[j]
+            if i == j:
+                turned += straight
+            tl.store(local + 12 * joint + 4 * i + j, turned, mask=there)
+            about -= turned * tl.load(joint_rest + 3 * joint + j, mask=joint < k, other=0.0)
+            if CORRECTED:
+                at = factors + e + 9 * place + 3 * i + j
+                if i == j:
+                    turned -= 1.0
+                tl.store(at, turned, mask=place >= 0)
+        tl.store(local + 12 * joint + 4 * i + 3, about, mask=there)
+    tl.store(factors + number, tl.load(expression + number, mask=number < e, other=0.0), mask=number < e)
+    tl.debug_barrier()  # Other threads read what this one wrote.
+    row, middle, column = tl.arange(0, 4)[:, None, None], tl.arange(0, 4)[None, :, None], tl.arange(0, 4)[None, None, :]
+    at, kept = 4 * tl.arange(0, 4)[:, None] + tl.arange(0, 4)[None, :], (tl.arange(0, 4) < 3)[:, None]
+    for step in range(k + 1):
+        index = tl.where(step == 0, k, step - 1)
+        parent = _parent(parents, index, k, IN_WORLD)
+        chained = tl.sum(_of_parent(transforms, parent, row, middle) * _homogeneous(local, index, middle, column), 1)
+        tl.store(transforms + 12 * index + at, chained, mask=kept)
+        tl.debug_barrier()
+    fourth = tl.where(tl.arange(0, 4)[None, :] == 3, 1.0, 0.0)
+    tl.store(pose + at, tl.where(kept, tl.load(local + 12 * k + at, mask=kept, other=0.0), fourth))
+
+
+@no_type_check
+@triton.jit
+def _move_joints_backward(
+    expression, joints, rotation, translation, joint_rest, turns, shifts, parents, free, k, e, local, transforms,
+    given, by_pose, by_factors, by_transforms, by_local, by_expression, by_joints, by_rotation, by_translation,
+    IN_WORLD: tl.constexpr, CORRECTED: tl.constexpr, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr,
+):  # fmt: skip
+    joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
+    four = tl.arange(0, 4)
+    at, kept = 4 * four[:, None] + four[None, :], (four < 3)[:, None]
+    for index in range(k):
+        tl.store(by_transforms + 12 * index + at, tl.load(given + 12 * index + at, mask=kept), mask=kept)
+    tl.store(by_transforms + 12 * k + at, tl.load(by_pose + at, mask=kept), mask=kept)
+    tl.debug_barrier()
+    row, middle, column = four[:, None, None], four[None, :, None], four[None, None, :]
+    for step in range(k + 1):
+        index = tl.where(step == k, k, k - 1 - step)
+        parent = _parent(parents, index, k, IN_WORLD)
+        gradient = tl.load(by_transforms + 12 * index + 4 * row + column, mask=row < 3, other=0.0)
+        turned = tl.where(row < 3, _of_parent(transforms, parent, row, middle), 0.0)
+        tl.store(by_local + 12 * index + at, tl.sum(turned * gradient, 0), mask=kept)
+        back = tl.sum(gradient * _homogeneous(local, index, middle, column), 2)
+        of_parent, known = by_transforms + 12 * parent + at, kept & (parent >= 0)
+        back += tl.load(of_parent, mask=known, other=0.0)
+        tl.debug_barrier()
+        tl.store(of_parent, back, mask=known)
+        tl.debug_barrier()
+    x = _turn(0, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
+    y = _turn(1, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
+    z = _turn(2, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
+    sine, cosine, _, by_sine, by_cosine = _factors(x, y, z)
+    there, place, vector = joint <= k, tl.load(free + joint, mask=joint < k, other=-1), (x, y, z)
+    trace, square, along = x * 0.0, x * 0.0, x * 0.0
+    curl_x, curl_y, curl_z, both_x, both_y, both_z = trace, trace, trace, trace, trace, trace
+    # Signs of the numbers of the cross product's matrix: which of x, y, z stands there.
+    signs = ((0, 0, 0), (0, 0, -1), (0, 1, 0)), ((0, 0, 1), (0, 0, 0), (-1, 0, 0)), ((0, -1, 0), (1, 0, 0), (0, 0, 0))
+    result = tl.load(by_factors + number, mask=number < e, other=0.0)
+    for i in tl.static_range(3):
+        moved = tl.load(by_local + 12 * joint + 4 * i + 3, mask=there, other=0.0)
+        result += _back_to_expression(i, moved, shifts, joint < k, k, e, JOINTS, EXPRESSIONS)
+        tl.store(by_translation + i + 0 * joint, moved, mask=joint == k)
+        for j in tl.static_range(3):
+            own = tl.load(by_local + 12 * joint + 4 * i + j, mask=there, other=0.0)
+            own -= moved * tl.load(joint_rest + 3 * joint + j, mask=joint < k, other=0.0)
+            if CORRECTED:
+                own += tl.load(by_factors + e + 9 * place + 3 * i + j, mask=place >= 0, other=0.0)
+            if i == j:
+                trace += own
+            square += own * vector[i] * vector[j]
+            curl_x, curl_y = curl_x + signs[i][j][0] * own, curl_y + signs[i][j][1] * own
+            curl_z += signs[i][j][2] * own
+            both_x += own * ((i == 0) * vector[j] + (j == 0) * vector[i])
+            both_y += own * ((i == 1) * vector[j] + (j == 1) * vector[i])
+            both_z += own * ((i == 2) * vector[j] + (j == 2) * vector[i])
+    along = x * curl_x + y * curl_y + z * curl_z
+    common = -sine * trace + by_sine * along + by_cosine * square
+    curl, both = (curl_x, curl_y, curl_z), (both_x, both_y, both_z)
+    for i in tl.static_range(3):
+        by_turn = vector[i] * common + sine * curl[i] + cosine * both[i]
+        tl.store(by_joints + 3 * place + i, by_turn, mask=place >= 0)
+        tl.store(by_rotation + i + 0 * joint, by_turn, mask=joint == k)
+        result += _back_to_expression(i, by_turn, turns, (joint < k) & (place < 0), k, e, JOINTS, EXPRESSIONS)
+    tl.store(by_expression + number, result, mask=number < e)
+
+
+@no_type_check
+@triton.jit
+def _back_to_expression(
+    axis: tl.constexpr, gradient, basis, chosen, k, e, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr
+):
+    joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
+    at, there = (number[:, None] * k + joint[None, :]) * 3 + axis, (number < e)[:, None] & chosen[None, :]
+    return tl.sum(tl.where(chosen, gradient, 0.0)[None, :] * tl.load(basis + at, mask=there, other=0.0), 1)
