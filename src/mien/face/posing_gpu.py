@@ -180,8 +180,9 @@ def _parent(parents, index, k, IN_WORLD: tl.constexpr):
 @triton.jit
 def _of_parent(transforms, parent, row, middle):
     """The transform of a parent, or the identity, as [4, 4, 1]; the last row is not used."""
-    known = tl.load(transforms + 12 * parent + 4 * row + middle, mask=(row < 3) & (parent >= 0), other=0.0)
-    return tl.where(parent >= 0, known, tl.where(row == middle, 1.0, 0.0))
+    has_parent = parent + 0 * row >= 0
+    known = tl.load(transforms + 12 * parent + 4 * row + middle, mask=(row < 3) & has_parent, other=0.0)
+    return tl.where(has_parent, known, tl.where(row == middle, 1.0, 0.0))
 
 
 @no_type_check
@@ -256,7 +257,7 @@ def _move_joints_backward(
         turned = tl.where(row < 3, _of_parent(transforms, parent, row, middle), 0.0)
         tl.store(by_local + 12 * index + at, tl.sum(turned * gradient, 0), mask=kept)
         back = tl.sum(gradient * _homogeneous(local, index, middle, column), 2)
-        of_parent, known = by_transforms + 12 * parent + at, kept & (parent >= 0)
+        of_parent, known = by_transforms + 12 * parent + at, kept & (parent + 0 * at >= 0)
         back += tl.load(of_parent, mask=known, other=0.0)
         tl.debug_barrier()
         tl.store(of_parent, back, mask=known)

@@ -1,5 +1,6 @@
 """The device that holds the tensors of training and rendering: the CPU, or a CUDA GPU through gsplat."""
 
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
 
@@ -61,3 +62,25 @@ def like_on(device: "torch.device | str") -> "torch.Tensor":
     import torch
 
     return torch.zeros((), device=device)
+
+
+def fetch(tensor: "torch.Tensor") -> "Callable[[], torch.Tensor]":
+    """Begin to copy a tensor to the CPU, and return a function that waits for the copy. Call it in another thread."""
+    import torch
+
+    if tensor.is_cpu:
+        return lambda: tensor
+    held = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
+    copied = torch.cuda.current_stream(tensor.device).record_event()
+
+    def result() -> torch.Tensor:
+        copied.synchronize()
+        return held
+
+    return result
+
+
+def upload(tensor: "torch.Tensor", like: "torch.Tensor") -> "torch.Tensor":
+    """The tensor on the device of `like`, with its float dtype, without waiting. On a GPU, it comes from pinned memory."""
+    held = tensor if like.is_cpu or not tensor.is_cpu or tensor.is_pinned() else tensor.pin_memory()
+    return held.to(like.device, like.dtype if tensor.is_floating_point() else tensor.dtype, non_blocking=True)

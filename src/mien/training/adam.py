@@ -14,6 +14,7 @@ from mien.arrays import unpacked
 from mien.avatar.avatar import ParameterGroup
 from mien.avatar.settings import Progress
 from mien.avatar.store import Moments
+from mien.kernels import on_gpu
 
 
 class Update(NamedTuple):
@@ -57,7 +58,10 @@ class Adam:
                     terms = group.factored[name].take()
                     if terms and rate > 0:
                         state = self._state(group, name, tensor, group.factored_moments)
-                        factored_update(FactoredUpdate(tensor, terms, state, rate))
+                        if on_gpu(tensor) and isinstance(state, Moments):
+                            updates.append(Update(tensor, _whole(terms), state, rate))
+                        else:
+                            factored_update(FactoredUpdate(tensor, terms, state, rate))
                     continue
                 gradient = tensor.grad
                 if gradient is None:
@@ -154,6 +158,10 @@ def factored_update(update: FactoredUpdate) -> None:
         factors = (list(unpacked(*side)) for side in zip(*terms, strict=True))
         apply: Any = _native.factored_update if factored else _native.factored_adam_update
         apply(native_values, *factors, *native_state, rate)
+    elif factored and on_gpu(values):
+        from mien.training.training_gpu import factored_update as on_device
+
+        on_device(values, terms, moments, rate)
     elif factored:
         factored_update_reference(update)
     else:

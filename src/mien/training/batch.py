@@ -163,9 +163,9 @@ def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings
         frame, _ = data.order.at(number)
         target, due = data.target(number, settings), perceptual.due(number, settings.steps)
         goal = data.goal(target, perceptual, number, settings) if due else None
-        camera = data.targets_at(number)[frame.sequence].camera(frame.camera)
-        index = state.track.index_of(frame.sequence, frame.timestep)
-        batch.append(BatchFrame(number, frame, index, state.track.face(index), camera, target, goal))
+        targets, index = data.targets_at(number)[frame.sequence], state.track.index_of(frame.sequence, frame.timestep)
+        cameras = targets.camera(frame.camera), targets.cameras_on_cpu[frame.camera]
+        batch.append(BatchFrame(number, frame, index, state.track.face(index), *cameras, target, goal))
     return batch
 
 

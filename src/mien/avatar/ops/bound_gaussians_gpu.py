@@ -141,7 +141,9 @@ def _frame(vertices, corners, there):
     area = _cross(along, second)
     height = tl.sqrt(_dot(area, area))
     normal = _times(area, 1 / height)
-    return second, along, normal, _cross(along, normal), edge, height, _times(_sum(_sum(v0, v1), v2), 1.0 / 3), flat
+    total = _sum(_sum(v0, v1), v2)
+    center = total[0] / 3, total[1] / 3, total[2] / 3
+    return second, along, normal, _cross(along, normal), edge, height, center, flat
 
 
 @no_type_check
@@ -284,9 +286,9 @@ def _bind_backward(
     by_along = _sum(by_along, _cross(second, by_area))
     by_first = _times(_sum(by_along, _times(along, -_dot(along, by_along))), 1 / edge)
     by_first = _sum(by_first, _times(along, by_size / 2))
-    by_second, third = _cross(by_area, along), _times(by_place, 1.0 / 3)
+    by_second = _cross(by_area, along)
     for i in tl.static_range(3):
         of_first, of_second = tl.where(flat, 0.0, by_first[i]), tl.where(flat, 0.0, by_second[i])
-        tl.atomic_add(by_vertices + 3 * corners[0] + i, third[i] - of_first - of_second, mask=there)
-        tl.atomic_add(by_vertices + 3 * corners[1] + i, third[i] + of_first, mask=there)
-        tl.atomic_add(by_vertices + 3 * corners[2] + i, third[i] + of_second, mask=there)
+        tl.atomic_add(by_vertices + 3 * corners[0] + i, by_place[i] / 3 - of_first - of_second, mask=there)
+        tl.atomic_add(by_vertices + 3 * corners[1] + i, by_place[i] / 3 + of_first, mask=there)
+        tl.atomic_add(by_vertices + 3 * corners[2] + i, by_place[i] / 3 + of_second, mask=there)

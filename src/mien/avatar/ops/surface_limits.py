@@ -13,6 +13,7 @@ from torch import Tensor
 from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.avatar.ops import Tensors
+from mien.kernels import on_gpu
 
 DEPTH = 0.003  # largest distance of a centre from the mesh along the normal, in metres. Not better: 6 mm with tilt 45
 HAIR_SHARE = 1.3  # how far a centre may lie above the scalp, beside the depth, as a multiple of the height of hair
@@ -60,6 +61,12 @@ def keep_on_surface(store: Tensors, limits: Float[Tensor, "f 5"], pulls: Float[T
             store["face_index"].long().contiguous(), limits.contiguous(), own, colors
         )
         _native.keep_on_surface(triangle, table, math.log(RATIO), means, quats, log_scales, pull, color)
+        return
+    if on_gpu(*arrays, limits) and all(own.is_contiguous() for own in arrays):
+        from mien.avatar.ops.surface_limits_gpu import keep_on_surface as on_device
+
+        means, quats, log_scales = arrays
+        on_device(store["face_index"], limits, math.log(RATIO), (means, quats, log_scales), store[_COLORS].detach(), pulls)
         return
     keep_on_surface_reference(store, limits)
     if pulls is not None:

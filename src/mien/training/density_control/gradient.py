@@ -37,6 +37,7 @@ from mien.avatar.density import GradientDensity
 from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.gaussians import Rendering
+from mien.kernels import on_gpu
 from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
 
 PRUNE_OPACITY = 0.005  # opacity below which Gaussians are removed. Of 3D Gaussian Splatting
@@ -62,6 +63,10 @@ class GradientStrategy(DensityStrategy):
         if is_native(gradient):
             arrays = unpacked(gradient, rendering.radii, opacities, *statistics)
             _native.observe_view(scale, *arrays)
+        elif on_gpu(gradient):
+            from mien.training.training_gpu import observe_view
+
+            observe_view(gradient, rendering.radii, opacities, scale, *statistics)
         else:
             observe_reference(gradient, rendering.radii, opacities, scale, *statistics)
 

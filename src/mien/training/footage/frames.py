@@ -92,6 +92,8 @@ class BatchFrame:
     face: FaceParams
     camera: Camera
     """Its camera, at the size of the target."""
+    camera_on_cpu: Camera
+    """The same in the memory of the CPU."""
     target: Target
     goal: Callable[[], Any] | None
     """Makes the goal of the perceptual loss. None if the frame is compared without that loss."""

@@ -135,8 +135,8 @@ class Targets:
         scale = min(1.0, resolution / longest) if resolution > 0 else 1.0
         self.width = max(1, round(sequence.capture.width * scale))
         self.height = max(1, round(sequence.capture.height * scale))
-        cameras = (camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
-        self.cameras = tuple(camera.to(like) for camera in cameras)
+        self.cameras_on_cpu = tuple(camera.resized(self.width, self.height) for camera in sequence.tracking.cameras)
+        self.cameras = tuple(camera.to(like) for camera in self.cameras_on_cpu)
         self._like, self._share = like, share
         self._on_cpu = is_native(like)
         self._cache: dict[tuple[int, int, bytes], Target] = {}
@@ -193,7 +193,7 @@ class Targets:
             boxes = self._boxes[timestep, camera] = (left, top, width, height), *self._tracked(timestep, camera)
         picture, color = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
         target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], color, *boxes[1:])
-        return target.pinned() if self._like.is_cuda else target
+        return target if self._like.is_cpu else target.pinned()
 
     def _image(self, timestep: int, camera: int, *, again: bool) -> UInt8[np.ndarray, "h w 3"]:
         """The picture at training resolution. `again` says that another background will need it."""

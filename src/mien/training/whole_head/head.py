@@ -49,16 +49,18 @@ class WholeHead:
         settings: TrainSettings,
         interior: Float[Tensor, "f 3"] | None,
         coverage: Coverage | None,
+        side_views: SideViews | None,
     ):
         """Take what the pictures show, and the colours of a mouth that is filled, on the device of the avatar.
 
-        `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled.
+        `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled. Side views are on
+        the CPU.
         """
         surface = avatar.extras.surface
         assert surface is not None
         self.unseen, self.coverage = unseen, coverage
         self.fills = unseen is not None and unseen.fills
-        self.side_views: SideViews | None = side_views_of(avatar.face_model, unseen, settings.side_weight)
+        self.side_views = side_views
         self.hair: HairSurface | None = None
         if unseen is not None and unseen.fills:
             self.hair = hair_surface(avatar, unseen.prior)
@@ -66,6 +68,8 @@ class WholeHead:
         """Triangles of which targets say whether the mesh hides them, on the CPU. None if nothing asks."""
         self._next_view: Callable[[], SideView] | None = None
         """Returns the side view of the step that runs. None if it has none."""
+        self._begun_view: Callable[[], SideView] | None = None
+        """On a GPU, returns the side view that was begun last."""
         self._avatar, self._surface, self._settings, self._interior = avatar, surface, settings, interior
 
     @property
@@ -96,7 +100,14 @@ class WholeHead:
         if side_views is not None and due:
             one = due[0]
             random = random_at(self._settings.seed, SIDE_VIEW, one.number)
-            self._next_view = meanwhile(side_views.drawn(one.face, one.camera, one.number, random))
+            if one.face.expression.is_cpu:
+                self._next_view = meanwhile(side_views.drawn(one.face, one.camera, one.number, random))
+                return
+            # A worker waits for the GPU, so the view is that which was begun when the last one was due.
+            assert self.unseen is not None
+            height = self.unseen.prior.fill_height
+            begun = meanwhile(side_views.fetched(one.face, one.camera_on_cpu, one.number, random, height))
+            self._next_view, self._begun_view = self._begun_view or begun, begun
 
     def posed(self, posed: Posed, one: BatchFrame) -> Posed:
         """The Gaussians of a frame, of which those that the mesh hides have a colour drawn at random."""
@@ -162,7 +173,7 @@ class WholeHead:
             return
         prior = self.hair.prior()
         self.unseen = replace(self.unseen, prior=prior)
-        if self.side_views is not None:
+        if self.side_views is not None and prior.hair.is_cpu:
             self.side_views = self.side_views.at_height(prior.fill_height)
 
 
@@ -190,8 +201,12 @@ def prepare_whole_head(
         coverage = coverage or measure_coverage(footage)
         interior = interior_colors(avatar, coverage)
 
+    views = side_views_of(model, avatar.subject, unseen, settings.side_weight)
+
     def make(like: Tensor) -> WholeHead:
         own = None if unseen is None else unseen.to(like)
-        return WholeHead(avatar, own, settings, None if interior is None else interior.to(like), coverage)
+        inside = None if interior is None else interior.to(like)
+        held = None if views is None else replace(views, held=views.compared.to(like.device))
+        return WholeHead(avatar, own, settings, inside, coverage, held)
 
     return make

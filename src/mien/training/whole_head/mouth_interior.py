@@ -17,6 +17,7 @@ from mien.avatar.bound_surface import BoundSurface
 from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.gaussians import sh_from_rgb
+from mien.kernels import on_gpu
 from mien.training.footage.coverage import Coverage
 from mien.training.whole_head.completion import complete_colors
 
@@ -56,11 +57,14 @@ def cover_hidden(
     """
     if hidden is None:
         return posed
-    gaussians, own = posed.gaussians, hidden.index_select(0, surface.triangles())
-    color = sh_from_rgb(torch.rand(3, generator=random)).to(gaussians.sh, non_blocking=True)
-    # Only on a CPU are rows found without waiting for the device.
-    covered = _Covered.apply if gaussians.sh.device.type == "cpu" else covered_reference
-    sh, opacities = covered(gaussians.sh, gaussians.opacities, own, color)
+    gaussians, color = posed.gaussians, sh_from_rgb(torch.rand(3, generator=random))
+    if on_gpu(gaussians.sh):
+        from mien.training.training_gpu import covered
+
+        sh, opacities = covered(gaussians.sh, gaussians.opacities, hidden, surface.triangles(), tuple(color.tolist()))
+    else:
+        own = hidden.index_select(0, surface.triangles())
+        sh, opacities = _Covered.apply(gaussians.sh, gaussians.opacities, own, color.to(gaussians.sh))
     return replace(posed, gaussians=replace(gaussians, sh=sh, opacities=opacities))
 
 

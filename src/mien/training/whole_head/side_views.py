@@ -23,6 +23,7 @@ from mien.face.head_parts import head_parts
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.machine import exact
+from mien.machine.devices import fetch, upload
 from mien.render import rasterize
 from mien.render.mesh import rasterize_mesh, vertex_normals
 from mien.runtime.rotation import axis_angle_from_matrix, matrix_from_axis_angle
@@ -69,6 +70,13 @@ class SideView:
     compared: Bool[Tensor, "h w"]
     """Pixels that show triangles of `SideViews.compared`."""
 
+    def to(self, like: Tensor) -> "SideView":
+        """This view on the device of `like`, with its float dtype, without waiting."""
+        face = FaceParams(**{name: upload(own, like) for name, own in self.face.tensors().items()})
+        camera = replace(self.camera, K=upload(self.camera.K, like), viewmat=upload(self.camera.viewmat, like))
+        pictures = (upload(own, like) for own in (self.background, self.picture, self.matte, self.compared))
+        return SideView(face, self.raised, camera, *pictures)
+
 
 @dataclass(frozen=True, eq=False)
 class SideViews:
@@ -87,6 +95,10 @@ class SideViews:
     """Triangles whose colours are compared in raised expressions: skin, lips and the inside of the mouth."""
     head_faces: Int[Tensor, "n 3"]
     """The face model's triangles without those of the neck."""
+    subject: FaceParams | None = None
+    """The person, for faces that are on a GPU."""
+    held: Bool[Tensor, " f"] | None = None
+    """`compared` on the device of the avatar. None for the CPU."""
 
     def at_height(self, height: Float[Tensor, " f"]) -> "SideViews":
         """The same views of a head whose triangles have another height, in metres."""
@@ -121,16 +133,40 @@ class SideViews:
 
         return make
 
+    def fetched(
+        self, face: FaceParams, camera: Camera, step: int, random: torch.Generator, height: Float[Tensor, " f"]
+    ) -> Callable[[], SideView]:
+        """`drawn` for a face and heights of triangles on a GPU. The returned function waits for them."""
+        parts = (face.expression, face.joints, face.head_rotation, face.head_translation, height)
+        fetching = fetch(torch.cat([own.detach().flatten() for own in parts]))
+
+        @torch.no_grad()
+        def make() -> SideView:
+            flat = fetching().split([own.numel() for own in parts])
+            expression, joints, rotation, translation, raised = (
+                own.view(part.shape) for own, part in zip(flat, parts, strict=True)
+            )
+            assert self.subject is not None
+            own = replace(self.subject, expression=expression, joints=joints, head_rotation=rotation)
+            own, views = replace(own, head_translation=translation), self.at_height(raised)
+            view = views.drawn(own, camera, step, random)()
+            # The same tensor of the identity says that the person's shape at rest need not be computed again.
+            whole = replace(view.face, identity=face.identity, vertex_offsets=face.vertex_offsets)
+            return replace(view, face=whole).to(face.expression)
+
+        return make
+
     def loss(self, avatar: Avatar, view: SideView, progress: Progress) -> Float[Tensor, ""]:
         """The weighted difference between the avatar and the completed mesh in one side view."""
-        like, posed = view.face.expression, avatar.pose(view.face, progress)
-        seen = rasterize(posed.gaussians.timestep(0), view.camera, view.background.to(like))
-        picture, counted = view.picture.to(like.device), view.compared.to(like.device)
+        like = avatar.face_model.template
+        view = replace(view.to(like), face=view.face)
+        posed = avatar.pose(view.face, progress)
+        seen = rasterize(posed.gaussians.timestep(0), view.camera, view.background)
         if view.raised:
-            own = color_loss(seen.image, picture, self.weight, _RAISED_FREE_DIFFERENCE, counted)
-            return own + _held_back(avatar, posed, self.compared)
-        outline = alpha_loss(seen.alpha, view.matte.to(like.device), self.weight * _SIDE_VIEWS_OUTLINE_WEIGHT)
-        return color_loss(seen.image, picture, self.weight) + outline
+            own = color_loss(seen.image, view.picture, self.weight, _RAISED_FREE_DIFFERENCE, view.compared)
+            return own + _held_back(avatar, posed, self.compared if self.held is None else self.held)
+        outline = alpha_loss(seen.alpha, view.matte, self.weight * _SIDE_VIEWS_OUTLINE_WEIGHT)
+        return color_loss(seen.image, view.picture, self.weight) + outline
 
     def _pictures(
         self,
@@ -181,14 +217,17 @@ def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Te
     return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
 
 
-def side_views_of(face_model: FaceModel, unseen: Unseen | None, weight: float) -> SideViews | None:
-    """The side views of a filled head, or None if nothing is filled or the weight is 0."""
+def side_views_of(
+    face_model: FaceModel, subject: FaceParams, unseen: Unseen | None, weight: float
+) -> SideViews | None:
+    """The side views of a filled head, or None if nothing is filled or the weight is 0. All is on the CPU."""
     if unseen is None or unseen.prior.filled_in is None or weight == 0:
         return None
     model, prior = face_model, unseen.prior
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
     assert prior.colors is not None
-    return side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
+    views = side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
+    return replace(views, subject=subject.to(like))
 
 
 def _held_back(avatar: Avatar, posed: Posed, compared: Bool[Tensor, " f"]) -> Float[Tensor, ""] | float:
@@ -201,7 +240,7 @@ def _held_back(avatar: Avatar, posed: Posed, compared: Bool[Tensor, " f"]) -> Fl
     also brings the shadows of the others.
     """
     surface = avatar.extras.surface
-    penalty = None if surface is None else surface.change_penalty(posed.aux, compared.to(surface.triangles().device))
+    penalty = None if surface is None else surface.change_penalty(posed.aux, compared)
     return 0.0 if penalty is None else _RAISED_CHANGE_WEIGHT * penalty
 
 
