@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from other_process import Holder
 
 torch.set_num_threads(1)
+# Without a GPU, Triton's interpreter runs kernels. It is chosen when Triton is imported.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 # The same examples on every machine, however busy it is.
 settings.register_profile("mien", deadline=None, derandomize=True)
 settings.load_profile("mien")

@@ -1,17 +1,14 @@
-"""Count what a GPU would have to launch in a step of training, on tensors of the device `meta`, and copies that wait.
+"""Count what a GPU would have to launch in a step of training, and what its host would wait for, on the device `meta`.
 
-An operator counts as one launch, unless it makes a view or takes memory; so does a fused operation (`mien.kernels`).
-gsplat is replaced by functions that launch nothing. `python tests/launches.py` prints a table by function.
+An operator counts as one launch, unless it makes a view or takes memory, and so does a kernel of mien's own
+(`mien.kernels`). gsplat is replaced by functions that launch nothing. `python tests/launches.py METHOD` prints a table.
 """
 
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -19,10 +16,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 META = torch.zeros((), device="meta")
 _FREE = {"_unsafe_view", "detach", "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "alias"}
+_pinned: list[Tensor] = []
 
 
 class Launches(TorchDispatchMode):
-    """Counts launches by the function of mien that asks for them, and copies between devices."""
+    """Counts launches by the function of mien that asks for them, and lists what waits for a GPU."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,12 +35,12 @@ class Launches(TorchDispatchMode):
         result = func(*args, **(kwargs or {}))
         name = func._schema.name.removeprefix("aten::")
         if on_meta(result) or on_meta(args):
-            if name in ("_to_copy", "copy_") and not on_meta(args[-1:]) and from_pageable(args, kwargs or {}):
-                self.waits.append(place())
+            if waits(name, args, kwargs or {}):
+                self.waits.append(f"{place()}: {name}")
             aliases = [one.alias_info for one in func._schema.returns]
             view = any(alias is not None and not alias.is_write for alias in aliases)
             if not view and name not in _FREE:
-                self.by_function[f"{place()} {name}"] += 1
+                self.by_function[place()] += 1
         return result
 
 
@@ -53,25 +51,40 @@ def on_meta(values: Any) -> bool:
     return isinstance(values, list | tuple) and any(on_meta(one) for one in values)
 
 
-def from_pageable(args: Any, kwargs: dict[str, Any]) -> bool:
-    """Return whether a copy is one from memory that is not pinned, or one that waits."""
+def waits(name: str, args: Any, kwargs: dict[str, Any]) -> bool:
+    """Return whether an operator copies from memory that is not pinned, or is told to wait for its copy."""
+    if name in ("_to_copy", "copy_"):
+        source = args[-1] if name == "copy_" and isinstance(args[-1], Tensor) else args[name == "copy_"]
+        at_once = kwargs.get("non_blocking", False) or (name == "copy_" and args[-1] is True)
+        return source.is_cpu and not (at_once and any(source is one for one in _pinned))
+    if name.startswith("index"):  # An index in the memory of the CPU is copied.
+        indices = [one for one in args[1:] if isinstance(one, list | tuple)]
+        return any(isinstance(one, Tensor) and one.is_cpu for own in indices for one in own)
     return False
+
+
+def pin(tensor: Tensor) -> Tensor:
+    """Return a copy that counts as pinned, in place of `Tensor.pin_memory`, which needs a GPU."""
+    _pinned.append(tensor.clone())
+    del _pinned[:-100]
+    return _pinned[-1]
 
 
 def place() -> str:
     """Return the innermost function of mien that runs, or that made the node whose backward pass runs."""
     frames = [frame for frame in traceback.extract_stack() if "/src/mien/" in frame.filename]
-    node, backward = torch._C._current_autograd_node(), ""
-    if node is not None and not frames[-1].name == "backward":
+    node = torch._C._current_autograd_node()
+    if node is not None and not (frames and frames[-1].name == "backward"):
         lines = [line for line in node.metadata.get("traceback_", []) if "/src/mien/" in line]
         if lines:
-            path, number, name = lines[-1].split("\n")[0].split(", ")
-            return f"{path.split('/')[-1].rstrip(chr(34))}:{name[3:]} backward"
-    return f"{frames[-1].filename.split('/')[-1]}:{frames[-1].name}" if frames else "?"
+            path, _, name = lines[-1].split("\n")[0].split(", ")
+            return f"{path.rpartition('/')[2].rstrip(chr(34))}:{name[3:]} backward"
+    own = [frame for frame in frames if not frame.filename.endswith("kernels.py")]
+    return f"{own[-1].filename.rpartition('/')[2]}:{own[-1].name}" if own else "?"
 
 
 class _Nothing(torch.autograd.Function):
-    """A result of some shapes that depends on tensors, without launches."""
+    """Results of some shapes that depend on tensors, without launches."""
 
     @staticmethod
     def forward(ctx: Any, shapes: tuple[tuple[int, ...], ...], *inputs: Tensor) -> Any:
@@ -81,33 +94,24 @@ class _Nothing(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        return None, *(torch.empty_like(one) if one.is_floating_point() else None for one in ctx.saved_tensors)
+        return None, *(torch.empty_like(one) for one in ctx.saved_tensors)
 
 
 def no_gsplat() -> ModuleType:
     """Return a module with the functions of gsplat that mien calls, which launch nothing."""
     gsplat: Any = ModuleType("gsplat")
 
-    def projection(means, covars, quats, scales, viewmats, Ks, width, height, **_):
-        given = [one for one in (means, covars, quats, scales, viewmats) if one is not None]
-        n = len(means)
-        means2d, depths, conics = _Nothing.apply(((1, n, 2), (1, n), (1, n, 3)), *given)
-        return torch.empty(1, n, 2, dtype=torch.int32, device="meta"), means2d, depths, conics, None
-
-    def harmonics(degree, directions, coefficients, masks=None):
-        return _Nothing.apply((directions.shape,), directions, coefficients)
-
-    def tiles(means2d, radii, depths, *_, **__):
-        empty = torch.empty(8, dtype=torch.int64, device="meta")
-        return empty, empty, empty
+    def projection(means, covars, quats, scales, viewmats, *_, **__):
+        n, given = len(means), [one for one in (means, covars, quats, scales, viewmats) if one is not None]
+        projected = _Nothing.apply(((1, n, 2), (1, n), (1, n, 3)), *given)
+        return torch.empty(1, n, 2, dtype=torch.int32, device="meta"), *projected, None
 
     def pixels(means2d, conics, colors, opacities, width, height, *_, backgrounds=None, **__):
         given = (means2d, conics, colors, opacities, backgrounds)
         return _Nothing.apply(((1, height, width, 3), (1, height, width, 1)), *given)
 
-    gsplat.fully_fused_projection, gsplat.spherical_harmonics = projection, harmonics
-    gsplat.isect_tiles, gsplat.rasterize_to_pixels = tiles, pixels
-    gsplat.isect_offset_encode = lambda *_: torch.empty(1, dtype=torch.int32, device="meta").expand(_[2] * _[3])
+    gsplat.fully_fused_projection, gsplat.rasterize_to_pixels = projection, pixels
+    gsplat.spherical_harmonics = lambda _, directions, sh: _Nothing.apply((directions.shape,), directions, sh)
+    gsplat.isect_tiles = lambda *_, **__: (torch.empty(8, dtype=torch.int64, device="meta"),) * 3
+    gsplat.isect_offset_encode = lambda _, __, columns, rows: torch.empty(1, rows, columns, device="meta")
     return gsplat
-
-

@@ -125,5 +125,8 @@ def clear_rows(chosen: Bool[Tensor, " n"], tensors: Sequence[Tensor]) -> None:
         (bytes_of_chosen,) = unpacked(chosen.view(torch.uint8))
         _native.clear_rows(bytes_of_chosen, unpacked(*tensors))
         return
+    if on_gpu(*tensors, chosen) and all(tensor.is_contiguous() for tensor in tensors):
+        import_module("mien.arrays_gpu").clear_rows(chosen, tensors)
+        return
     for tensor in tensors:
         tensor.masked_fill_(chosen.view(-1, *[1] * (tensor.ndim - 1)), 0)

@@ -165,7 +165,8 @@ class FaceModel:
         moved = (face.expression @ self.expression_basis.reshape(e, v * 3)).reshape(-1, v, 3)
         shaped = self.rest_vertices(face) + moved
         if self.pose_basis is not None:
-            turned = matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)
+            like = face.joints
+            turned = matrix_from_axis_angle(like) - torch.eye(3, dtype=like.dtype, device=like.device)
             shaped = shaped + torch.einsum("bp,pvc->bvc", turned.flatten(1), self.pose_basis)
         transforms = self.joint_transforms(face)
         moved = torch.einsum("vk,bkrc->bvrc", self.skinning_weights, transforms[:, :, :3])

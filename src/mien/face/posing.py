@@ -1,5 +1,6 @@
 """Native computation of vertices and head poses: autograd around the C++ core, for float32 on a CPU."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, final
 from weakref import WeakKeyDictionary
 
@@ -11,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.face.params import FaceParams
+from mien.kernels import on_gpu
 
 if TYPE_CHECKING:
     from mien.face.model import FaceModel
@@ -42,6 +44,8 @@ def head_poses(face: FaceParams) -> Float[Tensor, "b 4 4"]:
     The two agree to 1e-6. Avatars pass this one to renderers, so that pictures are the same as those without torch.
     """
     rotation, translation = face.head_rotation, face.head_translation
+    if on_gpu(rotation, translation):
+        return import_module("mien.face.posing_gpu").head_poses(rotation, translation)
     return _HeadPoses.apply(rotation, translation) if is_native(rotation, translation) else face.T_world_head
 
 

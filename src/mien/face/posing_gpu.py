@@ -36,6 +36,29 @@ def pose_face(model: "FaceModel", face: FaceParams, in_world: bool) -> tuple[Ten
     return _Pose.apply(constants, in_world, rest, joints, *motion)  # pyright: ignore[reportReturnType]
 
 
+def head_poses(rotation: Tensor, translation: Tensor) -> Tensor:
+    """`mien.face.posing.head_poses`: one launch forward and one backward."""
+    return _HeadPoses.apply(rotation, translation)  # pyright: ignore[reportReturnType]
+
+
+class _HeadPoses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rotation: Tensor, translation: Tensor) -> Tensor:
+        rotation, b = rotation.contiguous(), len(rotation)
+        poses = rotation.new_empty(b, 4, 4)
+        launch(_pose_heads, blocks(b, _BLOCK), rotation, translation.contiguous(), poses, b, BLOCK=_BLOCK)
+        ctx.save_for_backward(rotation)
+        return poses
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_poses: Tensor) -> tuple[Tensor, Tensor]:
+        (rotation,) = ctx.saved_tensors
+        results, b = (torch.empty_like(rotation), torch.empty_like(rotation)), len(rotation)
+        launch(_pose_heads_backward, blocks(b, _BLOCK), rotation, by_poses.contiguous(), *results, b, BLOCK=_BLOCK)
+        return results
+
+
 class _Constants:
     """A face model as the kernels take it."""
 
@@ -101,6 +124,40 @@ class _Pose(torch.autograd.Function):
 
 @no_type_check
 @triton.jit
+def _pose_heads(rotation, translation, poses, b, BLOCK: tl.constexpr):
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    x, y = tl.load(rotation + 3 * row, mask=row < b, other=0.0), tl.load(rotation + 3 * row + 1, mask=row < b, other=0.0)
+    z = tl.load(rotation + 3 * row + 2, mask=row < b, other=0.0)
+    for i in tl.static_range(3):
+        for j in tl.static_range(3):
+            tl.store(poses + 16 * row + 4 * i + j, rotation_entry(i, j, x, y, z), mask=row < b)
+        place = tl.load(translation + 3 * row + i, mask=row < b, other=0.0)
+        tl.store(poses + 16 * row + 4 * i + 3, place, mask=row < b)
+        tl.store(poses + 16 * row + 12 + i, x * 0.0, mask=row < b)
+    tl.store(poses + 16 * row + 15, x * 0.0 + 1.0, mask=row < b)
+
+
+@no_type_check
+@triton.jit
+def _pose_heads_backward(rotation, by_poses, by_rotation, by_translation, b, BLOCK: tl.constexpr):
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    x, y = tl.load(rotation + 3 * row, mask=row < b, other=0.0), tl.load(rotation + 3 * row + 1, mask=row < b, other=0.0)
+    z = tl.load(rotation + 3 * row + 2, mask=row < b, other=0.0)
+    by_x, by_y, by_z = x * 0.0, x * 0.0, x * 0.0
+    for i in tl.static_range(3):
+        place = tl.load(by_poses + 16 * row + 4 * i + 3, mask=row < b, other=0.0)
+        tl.store(by_translation + 3 * row + i, place, mask=row < b)
+        for j in tl.static_range(3):
+            own = tl.load(by_poses + 16 * row + 4 * i + j, mask=row < b, other=0.0)
+            to_x, to_y, to_z = _by_entry(i, j, own, x, y, z)
+            by_x, by_y, by_z = by_x + to_x, by_y + to_y, by_z + to_z
+    tl.store(by_rotation + 3 * row, by_x, mask=row < b)
+    tl.store(by_rotation + 3 * row + 1, by_y, mask=row < b)
+    tl.store(by_rotation + 3 * row + 2, by_z, mask=row < b)
+
+
+@no_type_check
+@triton.jit
 def _skin(rest, moved, blended, shaped, vertices, v, BLOCK: tl.constexpr):
     row, axis = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 4)
     at, there = 3 * row[:, None] + axis[None, :], (row < v)[:, None] & (axis < 3)[None, :]
@@ -152,7 +209,7 @@ def _derived(axis: tl.constexpr, expression, basis, k, e, JOINTS: tl.constexpr, 
 
 @no_type_check
 @triton.jit
-def _factors(x, y, z):
+def rotation_factors(x, y, z):
     """sin a / a, (1 - cos a) / a^2 and cos a of the angle a, and derivatives of the first two, divided by a."""
     squared = x * x + y * y + z * z
     small = squared < 1e-8
@@ -164,6 +221,41 @@ def _factors(x, y, z):
     by_sine = tl.where(small, -1.0 / 3, (straight - sine) / safe)
     by_cosine = tl.where(small, -1.0 / 12, (sine - 2 * cosine) / safe)
     return sine, cosine, straight, by_sine, by_cosine
+
+
+@no_type_check
+@triton.jit
+def rotation_entry(i: tl.constexpr, j: tl.constexpr, x, y, z):
+    """A number of a rotation's matrix: cos a I + sin a / a [v]x + (1 - cos a) / a^2 v v^T."""
+    sine, cosine, straight, _, _ = rotation_factors(x, y, z)
+    vector, cross = (x, y, z), ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    value = sine * cross[i][j] + cosine * vector[i] * vector[j]
+    return value + straight if i == j else value
+
+
+@no_type_check
+@triton.jit
+def _by_entry(i: tl.constexpr, j: tl.constexpr, gradient, x, y, z):
+    """The derivative by a rotation's vector of that number, times a gradient."""
+    sine, cosine, _, by_sine, by_cosine = rotation_factors(x, y, z)
+    vector, cross = (x, y, z), ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    along = by_sine * cross[i][j] + by_cosine * vector[i] * vector[j]
+    if i == j:
+        along -= sine
+    to_x, to_y, to_z = along * x, along * y, along * z
+    # Which of x, y and z stands in the cross product's matrix, with its sign.
+    if i != j:
+        sign: tl.constexpr = 1.0 if (j + 1) % 3 == i else -1.0
+        if 3 - i - j == 0:
+            to_x += sign * sine
+        elif 3 - i - j == 1:
+            to_y += sign * sine
+        else:
+            to_z += sign * sine
+    to_x += cosine * ((i == 0) * vector[j] + (j == 0) * vector[i])
+    to_y += cosine * ((i == 1) * vector[j] + (j == 1) * vector[i])
+    to_z += cosine * ((i == 2) * vector[j] + (j == 2) * vector[i])
+    return gradient * to_x, gradient * to_y, gradient * to_z
 
 
 @no_type_check
@@ -203,16 +295,12 @@ def _move_joints(
     x = _turn(0, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
     y = _turn(1, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
     z = _turn(2, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
-    sine, cosine, straight, _, _ = _factors(x, y, z)
-    vector, cross = (x, y, z), ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
     for i in tl.static_range(3):
         rest = tl.load(joint_rest + 3 * joint + i, mask=joint < k, other=0.0)
         about = rest + _derived(i, expression, shifts, k, e, JOINTS, EXPRESSIONS)
         about += tl.where(joint == k, tl.load(translation + i), 0.0)
         for j in tl.static_range(3):
-            turned = sine * cross[i][j] + cosine * vector[i] * vector[j]
-            if i == j:
-                turned += straight
+            turned = rotation_entry(i, j, x, y, z)
             tl.store(local + 12 * joint + 4 * i + j, turned, mask=there)
             about -= turned * tl.load(joint_rest + 3 * joint + j, mask=joint < k, other=0.0)
             if CORRECTED:
@@ -265,13 +353,9 @@ def _move_joints_backward(
     x = _turn(0, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
     y = _turn(1, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
     z = _turn(2, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
-    sine, cosine, _, by_sine, by_cosine = _factors(x, y, z)
-    there, place, vector = joint <= k, tl.load(free + joint, mask=joint < k, other=-1), (x, y, z)
-    trace, square, along = x * 0.0, x * 0.0, x * 0.0
-    curl_x, curl_y, curl_z, both_x, both_y, both_z = trace, trace, trace, trace, trace, trace
-    # Signs of the numbers of the cross product's matrix: which of x, y, z stands there.
-    signs = ((0, 0, 0), (0, 0, -1), (0, 1, 0)), ((0, 0, 1), (0, 0, 0), (-1, 0, 0)), ((0, -1, 0), (1, 0, 0), (0, 0, 0))
+    there, place = joint <= k, tl.load(free + joint, mask=joint < k, other=-1)
     result = tl.load(by_factors + number, mask=number < e, other=0.0)
+    by_x, by_y, by_z = x * 0.0, x * 0.0, x * 0.0
     for i in tl.static_range(3):
         moved = tl.load(by_local + 12 * joint + 4 * i + 3, mask=there, other=0.0)
         result += _back_to_expression(i, moved, shifts, joint < k, k, e, JOINTS, EXPRESSIONS)
@@ -281,22 +365,13 @@ def _move_joints_backward(
             own -= moved * tl.load(joint_rest + 3 * joint + j, mask=joint < k, other=0.0)
             if CORRECTED:
                 own += tl.load(by_factors + e + 9 * place + 3 * i + j, mask=place >= 0, other=0.0)
-            if i == j:
-                trace += own
-            square += own * vector[i] * vector[j]
-            curl_x, curl_y = curl_x + signs[i][j][0] * own, curl_y + signs[i][j][1] * own
-            curl_z += signs[i][j][2] * own
-            both_x += own * ((i == 0) * vector[j] + (j == 0) * vector[i])
-            both_y += own * ((i == 1) * vector[j] + (j == 1) * vector[i])
-            both_z += own * ((i == 2) * vector[j] + (j == 2) * vector[i])
-    along = x * curl_x + y * curl_y + z * curl_z
-    common = -sine * trace + by_sine * along + by_cosine * square
-    curl, both = (curl_x, curl_y, curl_z), (both_x, both_y, both_z)
+            to_x, to_y, to_z = _by_entry(i, j, own, x, y, z)
+            by_x, by_y, by_z = by_x + to_x, by_y + to_y, by_z + to_z
+    by_turns = by_x, by_y, by_z
     for i in tl.static_range(3):
-        by_turn = vector[i] * common + sine * curl[i] + cosine * both[i]
-        tl.store(by_joints + 3 * place + i, by_turn, mask=place >= 0)
-        tl.store(by_rotation + i + 0 * joint, by_turn, mask=joint == k)
-        result += _back_to_expression(i, by_turn, turns, (joint < k) & (place < 0), k, e, JOINTS, EXPRESSIONS)
+        tl.store(by_joints + 3 * place + i, by_turns[i], mask=place >= 0)
+        tl.store(by_rotation + i + 0 * joint, by_turns[i], mask=joint == k)
+        result += _back_to_expression(i, by_turns[i], turns, (joint < k) & (place < 0), k, e, JOINTS, EXPRESSIONS)
     tl.store(by_expression + number, result, mask=number < e)
 
 

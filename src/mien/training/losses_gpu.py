@@ -110,8 +110,9 @@ def _sign(values):
 
 @no_type_check
 @triton.jit
-def _color(picture, at, there, dtype, BYTES: tl.constexpr):
-    value = tl.load(picture + at, mask=there, other=0).to(dtype)
+def _color(picture, at, there, image, BYTES: tl.constexpr):
+    """Numbers of the target, 0..1, in the image's dtype."""
+    value = tl.load(picture + at, mask=there, other=0).to(image.dtype.element_ty)
     return value / 255 if BYTES else value
 
 
@@ -122,7 +123,8 @@ def _windows(
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The loss of a block of a box, and derivatives of SSIM by the window's mean, mean square and mean product."""
-    program, dtype = tl.program_id(0), image.dtype.element_ty
+    program = tl.program_id(0)
+    dtype = image.dtype.element_ty
     left, top, across, down, before, first, share = 0, 0, 0, 0, 0, 0, tl.cast(boxes[6], tl.float32)
     for i in tl.static_range(len(boxes) // 7):
         here = program >= tl.cast(boxes[7 * i + 4], tl.int32)
@@ -143,7 +145,7 @@ def _windows(
         weight = tl.exp(tl.cast(dy * dy + dx * dx, dtype) * _FALLOFF) / _TOTAL
         seen = there & (y + dy >= 0) & (y + dy < down) & (x + dx >= 0) & (x + dx < across)
         near = 3 * ((top + y + dy) * width + left + x + dx) + channel
-        own, other = tl.load(image + near, mask=seen, other=0.0), _color(target, near, seen, dtype, BYTES)
+        own, other = tl.load(image + near, mask=seen, other=0.0), _color(target, near, seen, image, BYTES)
         mean_x, mean_y = mean_x + weight * own, mean_y + weight * other
         square_x, square_y = square_x + weight * own * own, square_y + weight * other * other
         product += weight * own * other
@@ -159,7 +161,7 @@ def _windows(
     tl.store(slopes + total + first + at, scale * -likeness / below2, mask=there)
     tl.store(slopes + 2 * total + first + at, scale * 2 * above1 / (below1 * below2), mask=there)
     middle = 3 * ((top + y) * width + left + x) + channel
-    own, other = tl.load(image + middle, mask=there, other=0.0), _color(target, middle, there, dtype, BYTES)
+    own, other = tl.load(image + middle, mask=there, other=0.0), _color(target, middle, there, image, BYTES)
     loss = share * (l1 * tl.abs(own - other) + ssim * (1 - likeness))
     tl.store(sums + program, tl.sum(tl.where(counts, loss, 0.0), 0))
 
@@ -171,9 +173,10 @@ def _add_windows(
     BYTES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The derivative of the loss by each colour of the picture."""
-    at, dtype = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), image.dtype.element_ty
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    dtype = image.dtype.element_ty
     there, pixel, channel = at < elements, at // 3, at % 3
-    own, other = tl.load(image + at, mask=there, other=0.0), _color(target, at, there, dtype, BYTES)
+    own, other = tl.load(image + at, mask=there, other=0.0), _color(target, at, there, image, BYTES)
     result, sign = tl.zeros([BLOCK], dtype), _sign(own - other)
     for i in tl.static_range(len(boxes) // 7):
         across, down = tl.cast(boxes[7 * i + 2], tl.int32), tl.cast(boxes[7 * i + 3], tl.int32)

@@ -1,5 +1,6 @@
 """The training loop, for every method."""
 
+import math
 import time
 from collections.abc import Callable
 from collections.abc import Sequence as Items
@@ -375,7 +376,12 @@ def _after_update(
 
 
 def _record(state: TrainingState, losses: dict[str, Float[Tensor, ""]], psnr: float, step_ms: float) -> str:
-    entry = {name: float(value.data) for name, value in losses.items()}
+    # One answer of a GPU instead of one for each loss.
+    values = torch.stack([value.detach() for value in losses.values()]).tolist()
+    entry = dict(zip(losses, values, strict=True))
+    infinite = [name for name, value in entry.items() if not math.isfinite(value)]
+    if infinite:
+        raise CannotDrawError(f"the loss {infinite[0]} is {entry[infinite[0]]}")
     rare = [] if state.head is None else [*state.head.rare_losses]
     rare += ["perceptual"] if state.avatar.config.photometric.perceptual.weight > 0 else []
     for name in rare:

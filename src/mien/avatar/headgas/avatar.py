@@ -49,6 +49,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians, Rendering
+from mien.machine.devices import upload
 from mien.runtime.baked import AttributeNetwork, Attributes, FeatureChanges, FeatureDirections, MeshBound, Static
 from mien.runtime.still import standing_still
 
@@ -96,6 +97,7 @@ class HeadGas(Avatar):
             features, network = ablation.tensors(means, k, config), ablation.network(k, config)
         fixed = None if self.activations is None else {"face_index": triangles}
         self.store, self.network = GaussianStore(shapes | features, fixed), network.to(means)
+        self._shares: dict[tuple[int, torch.device, torch.dtype], Tensor] = {}
         self.bases_gradient, self._baked, self._ablation = FactoredGradient(), Kept[Static | MeshBound](), ablation
 
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
@@ -221,7 +223,7 @@ class HeadGas(Avatar):
         first, _, last = self.network
         assert isinstance(first, nn.Linear)
         assert isinstance(last, nn.Linear)
-        shares = self.output_shares(progress).to(last.weight)
+        shares = self._shares_on(last.weight, progress)
         layers = Layers(first.weight, first.bias, last.weight * shares[:, None], last.bias * shares)
         encoding = self.encoding()
         for e in inputs:
@@ -242,6 +244,14 @@ class HeadGas(Avatar):
         shares[1:] = config.sh_higher_share
         shares[(active_degree(config.sh_degree, config.sh_warmup, progress) + 1) ** 2 :] = 0
         return torch.cat([shares.flatten(), torch.ones(1)])
+
+    def _shares_on(self, like: Tensor, progress: Progress) -> Float[Tensor, " o"]:
+        """`output_shares` on the device of `like`, which are copied there once for each degree of colours."""
+        config = self.config
+        key = active_degree(config.sh_degree, config.sh_warmup, progress), like.device, like.dtype
+        if key not in self._shares:
+            self._shares[key] = upload(self.output_shares(progress), like)
+        return self._shares[key]
 
     def encoding(self) -> Float[Tensor, "n c"]:
         """The positional encoding of the centres."""

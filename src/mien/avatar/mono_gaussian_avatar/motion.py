@@ -244,7 +244,8 @@ def nearest_vertices(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "v 3"
 
 def _pose_features(face: FaceParams) -> Float[Tensor, "b p"]:
     """R - I of the free joints, row by row."""
-    return (matrix_from_axis_angle(face.joints) - torch.eye(3).to(face.joints)).flatten(1)
+    identity = torch.eye(3, dtype=face.joints.dtype, device=face.joints.device)
+    return (matrix_from_axis_angle(face.joints) - identity).flatten(1)
 
 
 def _inverse(pose: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:

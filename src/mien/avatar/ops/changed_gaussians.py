@@ -18,6 +18,7 @@ from mien.avatar.ops.feature_network import Layers, feature_network
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.gaussians import Gaussians
+from mien.kernels import on_gpu
 
 BASES = ("offset_basis", "color_basis", "opacity_basis")
 """Names of the bases of linear changes, which are also those of the changes."""
@@ -77,6 +78,13 @@ def pose_changed_gaussians_reference(
     face_model: FaceModel, face: FaceParams, store: Tensors, sh: Float[Tensor, "n k 3"], in_head: bool, changes: Changes
 ) -> tuple[Gaussians, dict[str, Tensor]]:
     """`pose_changed_gaussians` composed from its parts, for any dtype and device."""
+    local = {name: store[name] for name in ("face_index", *LOCAL)}
+    if on_gpu(store["means"], changes.activations):
+        from mien.avatar.ops.changed_gaussians_gpu import changed
+
+        local["means"], local["opacity_logits"], constant, found = changed(store, sh, changes)
+        sh = constant if sh.shape[1] == 1 else torch.cat([constant, sh[:, 1:]], dim=1)
+        return pose_bound_gaussians(face_model, face, local, sh, in_head), found
     rows, found = store["face_index"], dict[str, Tensor]()
     for name in changes.bases:
         basis = store[name]
@@ -87,7 +95,6 @@ def pose_changed_gaussians_reference(
         nothing = neutral.new_zeros(len(neutral), 0)
         outputs = feature_network(bases, changes.activations, rows, neutral, nothing, changes.layers, changes.gradient)
         found |= zip(FEATURES, outputs, strict=True)
-    local = {name: store[name] for name in ("face_index", *LOCAL)}
     local["means"] = _joined(local["means"], found, "offset_basis")
     local["opacity_logits"] = _joined(local["opacity_logits"], found, "opacity_basis", "feature_opacity")
     constant = _joined(sh[:, 0], found, "color_basis", "feature_color")[:, None]

@@ -17,6 +17,7 @@ from mien.arrays import is_native, unpacked
 from mien.avatar.ops.regions import region_shares, vertex_motions
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.kernels import on_gpu
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.baked import ExpressionChanges, HeadActivations
 from mien.runtime.posing import face_activations
@@ -97,6 +98,10 @@ class ExpressionActivations(nn.Module):
     def forward(self, face: FaceParams) -> Float[Tensor, "f a"]:
         """The activations of each triangle at one timestep. They have no gradient; native for float32 on a CPU."""
         parts = (face.expression, face.joints, face.head_rotation, face.head_translation)
+        if on_gpu(self.rest, *parts):
+            from mien.avatar.ops.expression_changes_gpu import activation_table
+
+            return activation_table(self, face, MARGIN, _LEAST_SEEN)
         if not is_native(self.rest, *parts):
             return self.reference(face)
         buffers = [*self.buffers()]

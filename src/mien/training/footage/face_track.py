@@ -12,6 +12,7 @@ from mien.avatar.avatar import ParameterGroup
 from mien.avatar.settings import FaceTuning, Rate
 from mien.avatar.store import Moments
 from mien.face.params import FaceParams
+from mien.machine.devices import upload
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
 
 _STILL_TURNS = 0.02
@@ -91,17 +92,18 @@ class FaceTrack:
         tuning, seen = self._tuning, self._seen()
         if not (tuning.enabled and (tuning.keep_mean_pose or tuning.keep_turns) and bool(seen.any())):
             return
-        start, now = self._start[seen], replace(self._start, **self._fields)[seen]
+        rows = upload(seen.nonzero()[:, 0], self._start.expression)  # A mask would make a GPU wait.
+        start, now = self._start[rows], replace(self._start, **self._fields)[rows]
         corrections = pose_corrections(start, now)
         trained = torch.zeros_like(seen).index_fill(0, torch.tensor(self._trained, dtype=torch.long), True)[seen]
         known = trained if bool(trained.any()) else torch.ones_like(trained)
         if tuning.keep_turns:
             corrections = without_turns(corrections, self._away[seen], self._sequence[seen], known)
         if tuning.keep_mean_pose:
-            corrections = corrections - corrections[known].mean(0)
+            corrections = corrections - corrections[upload(known.nonzero()[:, 0], corrections)].mean(0)
         steady = corrected_poses(start, corrections)
-        self._fields["head_rotation"][seen] = steady.head_rotation
-        self._fields["head_translation"][seen] = steady.head_translation
+        self._fields["head_rotation"].index_copy_(0, rows, steady.head_rotation)
+        self._fields["head_translation"].index_copy_(0, rows, steady.head_translation)
 
     def _row(self, index: int) -> tuple[FaceParams, list[ParameterGroup]]:
         # Cached, because a dozen views would otherwise be made in every step. The track's tensors are never replaced.
@@ -219,8 +221,8 @@ def without_turns(
         within[places == index] -= within[places == index].mean(0)
     doubt = len(within) * _STILL_TURNS**2 * torch.eye(3).to(away)
     slopes_of = torch.linalg.solve(within.T @ within + doubt, within.T)
-    slopes = slopes_of.to(corrections) @ corrections[known]
-    return corrections - (away - away[known].mean(0)).to(corrections) @ slopes
+    slopes = upload(slopes_of, corrections) @ corrections[upload(known.nonzero()[:, 0], corrections)]
+    return corrections - upload(away - away[known].mean(0), corrections) @ slopes
 
 
 def spread_corrections(tuned: Tensor, tracked: Tensor, seen: Tensor) -> None:

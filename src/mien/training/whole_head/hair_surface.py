@@ -83,6 +83,12 @@ class HairSurface:
         """The shift of all triangles along their normals, in metres; 0 outside of the scalp."""
         return self._on_all(self.state["shift"])
 
+    def to(self, like: Tensor) -> "HairSurface":
+        """The same on the device of `like`, with its dtype."""
+        state = {name: own.to(like) for name, own in self.state.items()}
+        places = self.scalp.to(like.device), self.kernel.to(like), self.mean.to(like), self.shown.to(like.device)
+        return HairSurface(*places, self.start.to(like), state)
+
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors of `state`."""
         self.state = {name: state[name].to(own) for name, own in self.state.items()}
@@ -103,21 +109,17 @@ class HairSurface:
 
 @torch.no_grad()
 def hair_surface(avatar: Avatar, prior: SurfacePrior) -> HairSurface | None:
-    """The surface of the hair at the start of a run. None if the face model has no scalp.
-
-    The avatar and what is known of its surface are on the same device.
-    """
+    """The surface of the hair at the start of a run. None if the face model has no scalp. All is on the CPU."""
     vertices = avatar.face_model.head_vertices(avatar.subject)[0].detach()
     scalp = head_parts(avatar.face_model).scalp.nonzero()[:, 0]
     if not len(scalp):
         return None
-    geometry = triangle_geometry(vertices.cpu().float(), avatar.face_model.faces.cpu())
+    geometry = triangle_geometry(vertices.float(), avatar.face_model.faces)
     middles, areas, normals = (values[scalp] for values in geometry)
     apart = torch.cdist(middles, middles, compute_mode="donot_use_mm_for_euclid_dist") / _HAIR_REACH
     kernel = torch.exp(-0.5 * apart.square()) * (apart < 3) * (normals @ normals.T > _HAIR_SAME_SIDE)
     mean = kernel * areas
     mean = mean / mean.sum(1, keepdim=True)
-    scalp = scalp.to(prior.hair.device)
     shown = torch.ones_like(scalp, dtype=torch.bool) if prior.filled_in is None else ~prior.filled_in[scalp]
     state = {name: prior.hair.new_zeros(len(scalp)) for name in ("shift", "first", "second", "gradient")}
     state["count"] = prior.hair.new_zeros(())

@@ -6,7 +6,7 @@ is inside a head explains only what the mesh shows of it. The trainer calls a `W
 
 from collections.abc import Callable
 from collections.abc import Sequence as Items
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -36,6 +36,25 @@ _RIGID_VIEWS = 4  # one of so many views is looked at
 _BOUND_EVERY = 250  # the same, from one time that Gaussians are bound anew to the next
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is found on the CPU before the avatar moves to its device, so that nothing has to come back."""
+
+    side_views: SideViews | None
+    """They stay on the CPU."""
+    hair: HairSurface | None
+    hideable: Bool[Tensor, " f"] | None
+    """Triangles of which targets say whether the mesh hides them, on the CPU. None if nothing asks."""
+    filled: int
+    """Number of Gaussians that are filled rather than trained."""
+
+    def to(self, like: Tensor) -> "Prepared":
+        """The same for an avatar on the device of `like`."""
+        views = self.side_views
+        views = None if views is None else replace(views, held=views.compared.to(like.device))
+        return replace(self, side_views=views, hair=None if self.hair is None else self.hair.to(like))
+
+
 class WholeHead:
     """What no training picture shows of a head, what is inside of it, and what is done about both."""
 
@@ -49,23 +68,18 @@ class WholeHead:
         settings: TrainSettings,
         interior: Float[Tensor, "f 3"] | None,
         coverage: Coverage | None,
-        side_views: SideViews | None,
+        prepared: Prepared,
     ):
         """Take what the pictures show, and the colours of a mouth that is filled, on the device of the avatar.
 
-        `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled. Side views are on
-        the CPU.
+        `unseen` is None if nothing is closed or limited, and `interior` if the mouth is not filled.
         """
         surface = avatar.extras.surface
         assert surface is not None
         self.unseen, self.coverage = unseen, coverage
         self.fills = unseen is not None and unseen.fills
-        self.side_views = side_views
-        self.hair: HairSurface | None = None
-        if unseen is not None and unseen.fills:
-            self.hair = hair_surface(avatar, unseen.prior)
-        self.hideable = None if settings.inside == "free" else inside_triangles(avatar.face_model)
-        """Triangles of which targets say whether the mesh hides them, on the CPU. None if nothing asks."""
+        self.side_views, self.hair, self.hideable = prepared.side_views, prepared.hair, prepared.hideable
+        self._filled = prepared.filled
         self._next_view: Callable[[], SideView] | None = None
         """Returns the side view of the step that runs. None if it has none."""
         self._begun_view: Callable[[], SideView] | None = None
@@ -79,7 +93,7 @@ class WholeHead:
 
     def density(self, control: DensityControl) -> DensityControl:
         """The avatar's density control, which spares what is closed."""
-        return control if self.unseen is None else spare_fills(self._surface, control, self.unseen)
+        return control if self.unseen is None else spare_fills(self._surface, control, self.unseen, self._filled)
 
     def weights(self, weights: Photometric) -> Photometric:
         """The weights of the losses that compare pictures."""
@@ -201,12 +215,20 @@ def prepare_whole_head(
         coverage = coverage or measure_coverage(footage)
         interior = interior_colors(avatar, coverage)
 
-    views = side_views_of(model, avatar.subject, unseen, settings.side_weight)
+    prepared = _prepared(avatar, unseen, settings)
 
     def make(like: Tensor) -> WholeHead:
         own = None if unseen is None else unseen.to(like)
         inside = None if interior is None else interior.to(like)
-        held = None if views is None else replace(views, held=views.compared.to(like.device))
-        return WholeHead(avatar, own, settings, inside, coverage, held)
+        return WholeHead(avatar, own, settings, inside, coverage, prepared.to(like))
 
     return make
+
+
+def _prepared(avatar: Avatar, unseen: Unseen | None, settings: TrainSettings) -> Prepared:
+    model, surface, hair, filled = avatar.face_model, avatar.extras.surface, None, None
+    if unseen is not None and surface is not None and unseen.fills:
+        hair, filled = hair_surface(avatar, unseen.prior), unseen.filled_in(surface)
+    views = side_views_of(model, avatar.subject, unseen, settings.side_weight)
+    hideable = None if settings.inside == "free" else inside_triangles(model)
+    return Prepared(views, hair, hideable, 0 if filled is None else int(filled.sum()))

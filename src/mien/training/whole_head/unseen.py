@@ -124,13 +124,12 @@ def fills_sides(frames: Items[Frame], settings: TrainSettings, *, bound: bool) -
     return settings.unseen == "filled"
 
 
-def spare_fills(surface: BoundSurface, density: DensityControl, unseen: Unseen) -> DensityControl:
-    """A density control whose resets spare closed surfaces, and whose limit does not count completed Gaussians."""
-    closed, filled_in = unseen.prior.closed, unseen.filled_in(surface)
+def spare_fills(surface: BoundSurface, density: DensityControl, unseen: Unseen, filled: int) -> DensityControl:
+    """A density control whose resets spare closed surfaces, and whose limit does not count the `filled` Gaussians."""
+    closed = unseen.prior.closed
     if closed is None or not isinstance(density, GradientDensity):
         return density
-    extra = 0 if filled_in is None else int(filled_in.sum())
-    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + extra)
+    settings = replace(density.settings, max_gaussians=density.settings.max_gaussians + filled)
     return replace(density, settings=settings, may_reset=lambda store: ~closed[surface.triangles()])
 
 
