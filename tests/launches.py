@@ -4,7 +4,6 @@ An operator counts as one launch, unless it makes a view or takes memory, and so
 (`mien.kernels`). gsplat is replaced by functions that launch nothing. `python tests/launches.py METHOD` prints a table.
 """
 
-import sys
 import traceback
 from collections import Counter
 from types import ModuleType

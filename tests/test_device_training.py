@@ -3,7 +3,7 @@
 Tensors that are not float32 on a CPU use the plain PyTorch twins of all native operations, and the reference rasterizer
 instead of gsplat. So training in float64 runs all the code of a GPU except gsplat's kernels."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,22 +15,16 @@ from torch import Tensor
 import mien.machine.devices
 import train_toy
 from mien import _native
-from mien.adam import FactoredMoments
 from mien.avatar import GaussianAvatarsConfig, load_avatar
-from mien.avatar.methods import METHODS
-from mien.avatar.settings import MethodConfig
-from mien.camera import Camera
 from mien.cli import main
 from mien.commands import render
 from mien.face import FaceModel
-from mien.gaussians import Gaussians, Rendering
 from mien.machine.devices import choose_device, gpu_memory_mb, like_on
-from mien.training import TrainSettings, batch, train, trainer
+from mien.training import TrainSettings, train
 from mien.training.checkpoint import TrainingState
 from mien.training.footage.sequence import Sequence
 from mien.training.trainer import start, step
 from mien.training.whole_head.hair_surface import HairSurface
-from plain_settings import plain_config, plain_run
 from refusals import refuses
 from shared_things import toy_workspace
 from toy_scene import toy_data, toy_sequence

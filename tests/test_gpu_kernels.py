@@ -98,13 +98,20 @@ def test_penalties(like: Tensor, n: int, bad: bool) -> None:
     rest = (torch.randint(0, 3, (n,), generator=torch.Generator().manual_seed(2)).int(), (1.0, 0.6), (0.01, 1.0))
     if bad and n:
         rest[0][n // 2] = 1
-    same(*(lambda own, f=f: f(*own.values(), *rest) for f in (triangle_penalties_reference, triangle_penalties)), tensors)
+    same(
+        *(lambda own, f=f: f(*own.values(), *rest) for f in (triangle_penalties_reference, triangle_penalties)), tensors
+    )
 
 
 @dtypes
 @pytest.mark.parametrize(
     ("size", "parts", "box"),
-    [((7, 9), (), None), ((20, 33), ((3, 2, 12, 9), (20, 10, 13, 10)), None), ((14, 6), (), (4, 5, 2, 9)), ((1, 1), (), None)],
+    [
+        ((7, 9), (), None),
+        ((20, 33), ((3, 2, 12, 9), (20, 10, 13, 10)), None),
+        ((14, 6), (), (4, 5, 2, 9)),
+        ((1, 1), (), None),
+    ],
 )
 def test_losses_of_pictures(like: Tensor, size: tuple[int, int], parts: tuple, box: Any) -> None:
     from mien.training.losses_gpu import alpha_loss, photometric_loss
@@ -277,7 +284,9 @@ def test_what_changes_tensors_in_place(like: Tensor, n: int) -> None:
     factored_update_reference(FactoredUpdate(values[0], terms, states[0], 0.01))
     factored_update(values[1], terms, states[1], 0.01)
     expected = [*store.values(), *known, values[0], states[0].second, states[0].weights]
-    for one, other in zip(expected, [*found.values(), *own, values[1], states[1].second, states[1].weights], strict=True):
+    for one, other in zip(
+        expected, [*found.values(), *own, values[1], states[1].second, states[1].weights], strict=True
+    ):
         assert_close(one, other)
 
 

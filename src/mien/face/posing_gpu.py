@@ -90,7 +90,11 @@ class _Pose(torch.autograd.Function):
     def forward(ctx: Any, own: _Constants, in_world: bool, *given: Tensor) -> tuple[Tensor, Tensor]:
         rest, joint_rest, *motion = (tensor.contiguous() for tensor in given)
         k, e, v = len(joint_rest), motion[0].shape[1], len(rest)
-        local, transforms, factors = rest.new_empty(k + 1, 12), rest.new_empty(k + 1, 12), rest.new_empty(len(own.basis))
+        local, transforms, factors = (
+            rest.new_empty(k + 1, 12),
+            rest.new_empty(k + 1, 12),
+            rest.new_empty(len(own.basis)),
+        )
         pose, vertices, shaped = rest.new_empty(1, 4, 4), rest.new_empty(1, v, 3), rest.new_empty(v, 3)
         joints = (*motion, joint_rest, own.turns, own.shifts, own.parents, own.free, k, e)
         sizes = {
@@ -108,7 +112,7 @@ class _Pose(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, by_vertices: Tensor, by_pose: Tensor) -> tuple[Tensor | None, ...]:
         *motion, local, transforms, shaped, blended = ctx.saved_tensors
-        own, v, k = ctx.own, len(shaped), len(local) - 1
+        own, v = ctx.own, len(shaped)
         by_shaped, outer = torch.empty_like(shaped), torch.empty_like(blended)
         by_vertices = by_vertices.contiguous()
         launch(_skin_backward, blocks(v, _BLOCK), by_vertices, blended, shaped, by_shaped, outer, v, BLOCK=_BLOCK)
@@ -126,7 +130,10 @@ class _Pose(torch.autograd.Function):
 @triton.jit
 def _pose_heads(rotation, translation, poses, b, BLOCK: tl.constexpr):
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    x, y = tl.load(rotation + 3 * row, mask=row < b, other=0.0), tl.load(rotation + 3 * row + 1, mask=row < b, other=0.0)
+    x, y = (
+        tl.load(rotation + 3 * row, mask=row < b, other=0.0),
+        tl.load(rotation + 3 * row + 1, mask=row < b, other=0.0),
+    )
     z = tl.load(rotation + 3 * row + 2, mask=row < b, other=0.0)
     for i in tl.static_range(3):
         for j in tl.static_range(3):
@@ -141,7 +148,10 @@ def _pose_heads(rotation, translation, poses, b, BLOCK: tl.constexpr):
 @triton.jit
 def _pose_heads_backward(rotation, by_poses, by_rotation, by_translation, b, BLOCK: tl.constexpr):
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    x, y = tl.load(rotation + 3 * row, mask=row < b, other=0.0), tl.load(rotation + 3 * row + 1, mask=row < b, other=0.0)
+    x, y = (
+        tl.load(rotation + 3 * row, mask=row < b, other=0.0),
+        tl.load(rotation + 3 * row + 1, mask=row < b, other=0.0),
+    )
     z = tl.load(rotation + 3 * row + 2, mask=row < b, other=0.0)
     by_x, by_y, by_z = x * 0.0, x * 0.0, x * 0.0
     for i in tl.static_range(3):
@@ -210,7 +220,7 @@ def _derived(axis: tl.constexpr, expression, basis, k, e, JOINTS: tl.constexpr, 
 @no_type_check
 @triton.jit
 def rotation_factors(x, y, z):
-    """sin a / a, (1 - cos a) / a^2 and cos a of the angle a, and derivatives of the first two, divided by a."""
+    """Sin a / a, (1 - cos a) / a^2 and cos a of the angle a, and derivatives of the first two, divided by a."""
     squared = x * x + y * y + z * z
     small = squared < 1e-8
     safe = tl.where(small, 1.0, squared)

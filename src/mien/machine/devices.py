@@ -81,6 +81,6 @@ def fetch(tensor: "torch.Tensor") -> "Callable[[], torch.Tensor]":
 
 
 def upload(tensor: "torch.Tensor", like: "torch.Tensor") -> "torch.Tensor":
-    """The tensor on the device of `like`, with its float dtype, without waiting. On a GPU, it comes from pinned memory."""
+    """The tensor on the device of `like`, with its float dtype. A GPU reads it from pinned memory, without waiting."""
     held = tensor if like.is_cpu or not tensor.is_cpu or tensor.is_pinned() else tensor.pin_memory()
     return held.to(like.device, like.dtype if tensor.is_floating_point() else tensor.dtype, non_blocking=True)

@@ -92,7 +92,9 @@ def _constant(sh, colors, size, BLOCK: tl.constexpr):
 def _constant_backward(colors, by_colors, result, size, BLOCK: tl.constexpr):
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     bright = tl.load(colors + at, mask=at < size, other=0.0) > 0
-    tl.store(result + at, tl.where(bright, tl.load(by_colors + at, mask=at < size, other=0.0) * _SH_C0, 0.0), mask=at < size)
+    tl.store(
+        result + at, tl.where(bright, tl.load(by_colors + at, mask=at < size, other=0.0) * _SH_C0, 0.0), mask=at < size
+    )
 
 
 @no_type_check
@@ -103,7 +105,9 @@ def _directions(means, viewmat, directions, n, BLOCK: tl.constexpr):
         position = -tl.load(viewmat + i) * tl.load(viewmat + 3)
         position -= tl.load(viewmat + 4 + i) * tl.load(viewmat + 7)
         position -= tl.load(viewmat + 8 + i) * tl.load(viewmat + 11)
-        tl.store(directions + 3 * row + i, tl.load(means + 3 * row + i, mask=row < n, other=0.0) - position, mask=row < n)
+        tl.store(
+            directions + 3 * row + i, tl.load(means + 3 * row + i, mask=row < n, other=0.0) - position, mask=row < n
+        )
 
 
 @no_type_check
@@ -112,8 +116,12 @@ def _camera_backward(viewmat, total, result):
     """The derivative by `viewmat` of directions whose derivatives add up to `total`."""
     row, column = tl.arange(0, 4)[:, None], tl.arange(0, 4)[None, :]
     turn = (row < 3) & (column < 3)
-    by_turn = tl.load(viewmat + 4 * row + 3, mask=row < 3, other=0.0) * tl.load(total + column, mask=column < 3, other=0.0)
-    by_shift = tl.load(viewmat + 4 * row + column, mask=turn, other=0.0) * tl.load(total + column, mask=column < 3, other=0.0)
+    by_turn = tl.load(viewmat + 4 * row + 3, mask=row < 3, other=0.0) * tl.load(
+        total + column, mask=column < 3, other=0.0
+    )
+    by_shift = tl.load(viewmat + 4 * row + column, mask=turn, other=0.0) * tl.load(
+        total + column, mask=column < 3, other=0.0
+    )
     shift = tl.where((row < 3) & (column == 3), tl.sum(by_shift, 1)[:, None], 0.0)
     tl.store(result + 4 * row + column, tl.where(turn, by_turn, shift))
 
@@ -132,6 +140,8 @@ def _three_sigma(conics, means2d, opacities, boxes, radii, n, width, height, BLO
     level = 2 * tl.maximum(level, 0.0) / (xx * yy - xy * xy)
     across, down = tl.sqrt(level * yy), tl.sqrt(level * xx)
     x, y = tl.load(means2d + 2 * row, mask=there, other=0.0), tl.load(means2d + 2 * row + 1, mask=there, other=0.0)
-    drawn = (tl.load(boxes + 2 * row, mask=there, other=0) > 0) & (tl.load(boxes + 2 * row + 1, mask=there, other=0) > 0)
+    drawn = (tl.load(boxes + 2 * row, mask=there, other=0) > 0) & (
+        tl.load(boxes + 2 * row + 1, mask=there, other=0) > 0
+    )
     drawn = drawn & (x + across > 0) & (y + down > 0) & (x - across < width) & (y - down < height)
     tl.store(radii + row, tl.where(drawn, reach, 0.0).to(tl.int32), mask=there)

@@ -1,4 +1,4 @@
-"""Small parts of a training step in kernels for a GPU: statistics, hidden Gaussians, and updates of factored tensors."""
+"""Small parts of a training step in kernels for a GPU: statistics, hidden Gaussians, updates of factored tensors."""
 
 from collections.abc import Sequence
 from typing import Any, no_type_check

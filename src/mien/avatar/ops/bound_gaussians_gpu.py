@@ -129,7 +129,11 @@ def _corners(faces, face_index, row, there):
 @triton.jit
 def _frame(vertices, corners, there):
     """Edges, unit axes, lengths and centroid of each Gaussian's triangle, and whether it is degenerate."""
-    v0, v1, v2 = _three(vertices, corners[0], there), _three(vertices, corners[1], there), _three(vertices, corners[2], there)
+    v0, v1, v2 = (
+        _three(vertices, corners[0], there),
+        _three(vertices, corners[1], there),
+        _three(vertices, corners[2], there),
+    )
     first, second = _sum(v1, _times(v0, -1.0)), _sum(v2, _times(v0, -1.0))
     edge, area = tl.sqrt(_dot(first, first)), _cross(first, second)
     flat = (edge < _SHORTEST) | (tl.sqrt(_dot(area, area)) < _SHORTEST * edge)
@@ -207,7 +211,7 @@ def _store_quaternion(quats, row, one, two, three, there):
     w, x, y, z = 1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22
     wx, wy, wz = two[2] - three[1], three[0] - one[2], one[1] - two[0]
     xy, xz, yz = two[0] + one[1], three[0] + one[2], three[1] + two[2]
-    of_x, of_y, of_z = (x >= y) & (x >= z), (y > x) & (y >= z), (z > x) & (z > y)
+    of_x, of_y = (x >= y) & (x >= z), (y > x) & (y >= z)
     of_w = (w >= x) & (w >= y) & (w >= z)
     a = tl.where(of_w, w, tl.where(of_x, wx, tl.where(of_y, wy, wz)))
     b = tl.where(of_w, wx, tl.where(of_x, x, tl.where(of_y, xy, xz)))
@@ -218,6 +222,39 @@ def _store_quaternion(quats, row, one, two, three, there):
     tl.store(quats + 4 * row + 1, b * scale, mask=there)
     tl.store(quats + 4 * row + 2, c * scale, mask=there)
     tl.store(quats + 4 * row + 3, d * scale, mask=there)
+
+
+@no_type_check
+@triton.jit
+def _by_column(i: tl.constexpr, a, b, c, w, x, y, z):
+    """The derivative by a unit quaternion of a column of its matrix, times the gradient a, b, c."""
+    if i == 0:
+        by_w, by_x = z * b - y * c, y * b + z * c
+        by_y, by_z = x * b - w * c - 2 * y * a, w * b + x * c - 2 * z * a
+    elif i == 1:
+        by_w, by_y = x * c - z * a, x * a + z * c
+        by_x, by_z = y * a + w * c - 2 * x * b, y * c - w * a - 2 * z * b
+    else:
+        by_w, by_z = y * a - x * b, x * a + y * b
+        by_x, by_y = z * a - w * b - 2 * x * c, w * a + z * b - 2 * y * c
+    return 2 * by_w, 2 * by_x, 2 * by_y, 2 * by_z
+
+
+@no_type_check
+@triton.jit
+def _by_edges(second, along, normal, edge, height, by_along, by_normal, by_across, by_size):
+    """The derivative by the triangle's edges of a frame with these gradients.
+
+    across = along x normal, normal = (along x second) / height, along = first / edge.
+    """
+    by_along = _sum(by_along, _cross(normal, by_across))
+    by_normal = _sum(by_normal, _cross(by_across, along))
+    by_area = _times(_sum(by_normal, _times(normal, -_dot(normal, by_normal))), 1 / height)
+    by_area = _sum(by_area, _times(normal, by_size / 2))
+    by_along = _sum(by_along, _cross(second, by_area))
+    by_first = _times(_sum(by_along, _times(along, -_dot(along, by_along))), 1 / edge)
+    by_first = _sum(by_first, _times(along, by_size / 2))
+    return by_first, _cross(by_area, along)
 
 
 @no_type_check
@@ -243,9 +280,8 @@ def _bind_backward(
     # The covariance is M M^T with M = R Q S: its derivative by M is twice that by the covariance, times M.
     unit, scale, columns = _rotation(quats, row, there)
     raw = _three(log_scales, row, there)
-    xx, xy = tl.load(by_covariances + 6 * row, mask=there, other=0.0), tl.load(by_covariances + 6 * row + 1, mask=there, other=0.0)
-    xz, yy = tl.load(by_covariances + 6 * row + 2, mask=there, other=0.0), tl.load(by_covariances + 6 * row + 3, mask=there, other=0.0)
-    yz, zz = tl.load(by_covariances + 6 * row + 4, mask=there, other=0.0), tl.load(by_covariances + 6 * row + 5, mask=there, other=0.0)
+    xx, xy, xz = _three(by_covariances, 2 * row, there)
+    yy, yz, zz = _three(by_covariances, 2 * row + 1, there)
     by_w, by_x, by_y, by_z = size * 0.0, size * 0.0, size * 0.0, size * 0.0
     w, x, y, z = unit
     for i in tl.static_range(3):
@@ -264,29 +300,14 @@ def _bind_backward(
         by_normal = _sum(by_normal, _times(by_column, columns[i][1]))
         by_across = _sum(by_across, _times(by_column, columns[i][2]))
         a, b, c = _dot(along, by_column), _dot(normal, by_column), _dot(across, by_column)
-        if i == 0:
-            by_w, by_x = by_w + 2 * (z * b - y * c), by_x + 2 * (y * b + z * c)
-            by_y, by_z = by_y + 2 * (x * b - w * c - 2 * y * a), by_z + 2 * (w * b + x * c - 2 * z * a)
-        elif i == 1:
-            by_w, by_y = by_w + 2 * (x * c - z * a), by_y + 2 * (x * a + z * c)
-            by_x, by_z = by_x + 2 * (y * a + w * c - 2 * x * b), by_z + 2 * (y * c - w * a - 2 * z * b)
-        else:
-            by_w, by_z = by_w + 2 * (y * a - x * b), by_z + 2 * (x * a + y * b)
-            by_x, by_y = by_x + 2 * (z * a - w * b - 2 * x * c), by_y + 2 * (w * a + z * b - 2 * y * c)
+        to_w, to_x, to_y, to_z = _by_column(i, a, b, c, w, x, y, z)
+        by_w, by_x, by_y, by_z = by_w + to_w, by_x + to_x, by_y + to_y, by_z + to_z
     along_unit = w * by_w + x * by_x + y * by_y + z * by_z
     tl.store(by_quats + 4 * row, scale * (by_w - w * along_unit), mask=there)
     tl.store(by_quats + 4 * row + 1, scale * (by_x - x * along_unit), mask=there)
     tl.store(by_quats + 4 * row + 2, scale * (by_y - y * along_unit), mask=there)
     tl.store(by_quats + 4 * row + 3, scale * (by_z - z * along_unit), mask=there)
-    # The frame: across = along x normal, normal = (along x second) / height, along = first / edge.
-    by_along = _sum(by_along, _cross(normal, by_across))
-    by_normal = _sum(by_normal, _cross(by_across, along))
-    by_area = _times(_sum(by_normal, _times(normal, -_dot(normal, by_normal))), 1 / height)
-    by_area = _sum(by_area, _times(normal, by_size / 2))
-    by_along = _sum(by_along, _cross(second, by_area))
-    by_first = _times(_sum(by_along, _times(along, -_dot(along, by_along))), 1 / edge)
-    by_first = _sum(by_first, _times(along, by_size / 2))
-    by_second = _cross(by_area, along)
+    by_first, by_second = _by_edges(second, along, normal, edge, height, by_along, by_normal, by_across, by_size)
     for i in tl.static_range(3):
         of_first, of_second = tl.where(flat, 0.0, by_first[i]), tl.where(flat, 0.0, by_second[i])
         tl.atomic_add(by_vertices + 3 * corners[0] + i, by_place[i] / 3 - of_first - of_second, mask=there)

@@ -20,8 +20,10 @@ _OUTPUTS = 4
 def changed(
     store: Any, sh: Tensor, changes: Changes
 ) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:  # fmt: skip
-    """Centres, raw opacities and constant coefficients [n, 1, 3] with their changes; and by name, the changes and their
-    weighted mean squares, as `mien.avatar.ops.changed_gaussians.pose_changed_gaussians` returns them."""
+    """Centres, raw opacities and constant coefficients [n, 1, 3] with their changes, and what changed, by name.
+
+    The last are the changes and their weighted mean squares, as `pose_changed_gaussians` returns them.
+    """
     bases = [store[name] if name in changes.bases else None for name in BASES]
     layers, neutral, features = changes.layers, None, None
     if layers is not None:
@@ -204,7 +206,9 @@ def _by_change(by_joined, by_own, by_penalty, value, at, there, scale):
 
 @no_type_check
 @triton.jit
-def _to_basis(result, activations, row, triangle, there, gradient, part, parts, LINEAR: tl.constexpr, COUNT: tl.constexpr):
+def _to_basis(
+    result, activations, row, triangle, there, gradient, part, parts, LINEAR: tl.constexpr, COUNT: tl.constexpr
+):
     for i in tl.static_range(LINEAR):
         own = gradient * tl.load(activations + triangle * COUNT + i, mask=there, other=0.0)
         tl.store(result + (row * parts + part) * LINEAR + i, own, mask=there)

@@ -66,7 +66,9 @@ def keep_on_surface(store: Tensors, limits: Float[Tensor, "f 5"], pulls: Float[T
         from mien.avatar.ops.surface_limits_gpu import keep_on_surface as on_device
 
         means, quats, log_scales = arrays
-        on_device(store["face_index"], limits, math.log(RATIO), (means, quats, log_scales), store[_COLORS].detach(), pulls)
+        on_device(
+            store["face_index"], limits, math.log(RATIO), (means, quats, log_scales), store[_COLORS].detach(), pulls
+        )
         return
     keep_on_surface_reference(store, limits)
     if pulls is not None:

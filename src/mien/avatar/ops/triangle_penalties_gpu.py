@@ -94,11 +94,11 @@ def _gradients(
     means, log_scales, radii, values, of_position, of_scale, by_means, by_scales, n, farthest, largest, by_position,
     by_scale, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    at, there, drawn, center, length, far, scale, large = _excess(
-        means, log_scales, radii, n, farthest, largest, BLOCK
-    )
+    at, there, drawn, center, length, far, scale, large = _excess(means, log_scales, radii, n, farthest, largest, BLOCK)
     share = tl.where(drawn, 1.0 / tl.load(values + 2), 0.0)
-    position = tl.load(of_position) * by_position * share * tl.where(far == 0, 0.0, 1.0 / tl.where(far == 0, 1.0, length))
+    position = (
+        tl.load(of_position) * by_position * share * tl.where(far == 0, 0.0, 1.0 / tl.where(far == 0, 1.0, length))
+    )
     total = tl.sqrt(tl.sum(large * large, 1))
     size = tl.load(of_scale) * by_scale * share * tl.where(total == 0, 0.0, 1.0 / tl.where(total == 0, 1.0, total))
     tl.store(by_means + at, center * position[:, None], mask=there)

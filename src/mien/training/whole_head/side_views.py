@@ -217,9 +217,7 @@ def _at_vertices(face_model: FaceModel, values: Float[Tensor, " f"]) -> Float[Te
     return vertex_means(face_model, values[:, None].expand(-1, 3))[:, 0]
 
 
-def side_views_of(
-    face_model: FaceModel, subject: FaceParams, unseen: Unseen | None, weight: float
-) -> SideViews | None:
+def side_views_of(face_model: FaceModel, subject: FaceParams, unseen: Unseen | None, weight: float) -> SideViews | None:
     """The side views of a filled head, or None if nothing is filled or the weight is 0. All is on the CPU."""
     if unseen is None or unseen.prior.filled_in is None or weight == 0:
         return None
