@@ -186,7 +186,7 @@ def test_fills_keep_their_opacity_at_resets(toy: Toy) -> None:
     unseen, store = measured(toy, avatar), avatar.store
     surface_of(avatar).close(unseen.prior)
     before, fills = store["opacity_logits"].sigmoid(), known(unseen.filled_in(surface_of(avatar)))
-    control = spare_fills(surface_of(avatar), avatar.density(), unseen)
+    control = spare_fills(surface_of(avatar), avatar.density(), unseen, int(fills.sum()))
     assert isinstance(control, GradientDensity)
     assert control.settings.max_gaussians == plain_gaussian_avatars().density.max_gaussians + int(fills.sum())
     posed = avatar.pose(toy[1].tracking.face[0])

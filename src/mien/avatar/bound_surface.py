@@ -115,7 +115,8 @@ class BoundSurface:
         """Sizes of the triangles of the neutral head, in metres per triangle unit."""
         if self._known is None:
             self._known = triangle_frames(*self._mesh()).k.detach()
-        return self._known.to(self._store["means"])  # the avatar may have moved since
+        self._known = self._known.to(self._store["means"])  # the avatar may have moved since
+        return self._known
 
     @torch.no_grad()
     def set_first_colors(self, colors: Float[Tensor, "v 3"]) -> None:

@@ -156,8 +156,8 @@ class FreePoints(Avatar, ABC):
     def chosen_means(self, progress: Progress) -> Float[Tensor, "p 3"]:
         """The next `face_points` points, detached: on average, losses of them are the paper's means over all points."""
         n, count, turn = len(self.store), self.config.face_points, progress.step // progress.frames
-        means, chosen = self.store["means"].detach(), torch.arange(turn * count, (turn + 1) * count)
-        return means[chosen[:n].to(means.device) % n]
+        means, last = self.store["means"].detach(), turn * count + min(count, n)
+        return means[torch.arange(turn * count, last, device=means.device) % n]
 
     def baked_motion(self) -> BakedMotion:
         """The points as those of a rig with blend directions and skinning weights."""

@@ -188,9 +188,10 @@ def _change(
 @no_type_check
 @triton.jit
 def _optional(values, at, there, factor):
-    if values is None:
-        return factor * 0.0
-    return factor * tl.load(values + at, mask=there, other=0.0)
+    result = factor * 0.0
+    if values is not None:
+        result += factor * tl.load(values + at, mask=there, other=0.0)
+    return result
 
 
 @no_type_check

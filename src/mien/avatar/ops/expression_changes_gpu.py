@@ -75,12 +75,10 @@ def _activations(
         numbers = tl.arange(0, HIGH)
         pose = tl.load(head_directions + numbers, mask=numbers < POSE, other=0.0) * 0.0
         for i in tl.static_range(3):
-            j: tl.constexpr = (i + 1) % 3
-            k: tl.constexpr = (i + 2) % 3
             sine, shift = 0.0 * x, 0.0 * x
             for m in tl.static_range(3):
-                sine += rotation_entry(m, k, a, b, c) * rotation_entry(m, j, x, y, z)
-                sine -= rotation_entry(m, j, a, b, c) * rotation_entry(m, k, x, y, z)
+                sine += rotation_entry(m, (i + 2) % 3, a, b, c) * rotation_entry(m, (i + 1) % 3, x, y, z)
+                sine -= rotation_entry(m, (i + 1) % 3, a, b, c) * rotation_entry(m, (i + 2) % 3, x, y, z)
                 shift += (tl.load(translation + m) - tl.load(head_rest + 3 + m)) * rotation_entry(m, i, a, b, c)
             pose += sine / 2 * tl.load(head_directions + POSE * i + numbers, mask=numbers < POSE, other=0.0)
             pose += shift * tl.load(head_directions + POSE * (3 + i) + numbers, mask=numbers < POSE, other=0.0)

@@ -76,7 +76,8 @@ class PointAvatar(FreePoints):
         sh = sh_from_rgb(colors)[..., None, :]
         like, n = means.detach(), len(self.store)
         scales = like.new_full((n, 3), self.radius(progress.fraction) / 2)
-        quats = like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+        quats = like.new_zeros(n, 4)
+        quats[:, 0] = 1
         opacities = like.new_full((n,), _OPACITY)
         return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
 

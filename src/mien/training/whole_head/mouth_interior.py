@@ -64,7 +64,9 @@ def cover_hidden(
         sh, opacities = covered(gaussians.sh, gaussians.opacities, hidden, surface.triangles(), tuple(color.tolist()))
     else:
         own = hidden.index_select(0, surface.triangles())
-        sh, opacities = _Covered.apply(gaussians.sh, gaussians.opacities, own, color.to(gaussians.sh))
+        # Only on a CPU are rows found without waiting for the device.
+        cover = _Covered.apply if own.is_cpu else covered_reference
+        sh, opacities = cover(gaussians.sh, gaussians.opacities, own, color.to(gaussians.sh))
     return replace(posed, gaussians=replace(gaussians, sh=sh, opacities=opacities))
 
 
