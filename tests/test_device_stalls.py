@@ -41,6 +41,10 @@ class Constants(TorchFunctionMode):
 
 @pytest.fixture(autouse=True)
 def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch)
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let tensors on `meta` be drawn by a gsplat without kernels, and what comes back be a face."""
     monkeypatch.setitem(sys.modules, "gsplat", no_gsplat())
     rasterize = sys.modules["mien.render.rasterize"]
@@ -120,11 +124,15 @@ def test_a_step_of_a_paper_has_few_launches(method: str, most: int) -> None:
     assert max(counts[1:]) <= most, counts
 
 
+def default() -> tuple[MethodConfig, TrainSettings]:
+    """Sides that are filled, limits, hair that moves, features, and a mouth that hides what is in it."""
+    return GaussianAvatarsConfig(), TrainSettings(unseen="filled", mesh="fitted", **LONG)
+
+
 @pytest.mark.unchecked
 def test_the_default_has_few_launches_and_side_views_at_most_twice_as_many() -> None:
-    """With sides that are filled, limits, hair that moves, features, and a mouth that hides what is in it."""
-    settings = TrainSettings(unseen="filled", mesh="fitted", **LONG)
-    counts = [count for _, count in steps(without_features(GaussianAvatarsConfig()), settings, 9)]
+    config, settings = default()
+    counts = [count for _, count in steps(without_features(config), settings, 9)]
     with_views = counts[4::4]
     assert max(counts[1:4] + counts[5:8]) <= 90, counts
     assert max(with_views) <= 180, counts
