@@ -143,10 +143,15 @@ def test_a_picture_that_is_not_finite_has_no_finite_loss() -> None:
 
 
 def jointed(like: Tensor) -> FaceModel:
-    """A face model with correctives, and a joint that moves with another."""
+    """A face model with correctives, and a joint that moves with another.
+
+    The kernel blends transforms to the world, so weights have to sum to 1 in the dtype: a head is half a metre away.
+    """
     model, v = toy_face_model(), len(toy_face_model().template)
+    weights = model.skinning_weights.double()
     return replace(
         model, pose_basis=0.01 * random(9, v, 3), joint_parents=(-1, 0, 1),
+        skinning_weights=weights / weights.sum(1, keepdim=True),
         joint_identity_basis=0.01 * random(2, 3, 3, seed=5), joint_translation_basis=0.01 * random(2, 3, 3, seed=6),
     ).to(like)  # fmt: skip
 

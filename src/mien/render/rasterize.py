@@ -50,8 +50,8 @@ def rasterize(
     `auto` is `native` for float32 on a CPU, `gsplat` on a GPU, and otherwise (float64) the slow `reference`.
 
     Raises:
-        ValueError: An input holds NaN or infinity (the message names it), shapes or lengths do not fit, or a dtype or
-            device is wrong.
+        ValueError: An input holds NaN or infinity (the message names it; a GPU is not asked while gradients are
+            recorded), shapes or lengths do not fit, or a dtype or device is wrong.
     """
     if background is None:
         background = gaussians.means.new_zeros(3)
