@@ -67,7 +67,7 @@ def prepare_posing(
     if len(face) != 1 or not has_native_posing(face_model, face) or store["means"].dtype != torch.float32:
         return None
     compiled = compiled_model(face_model)
-    rest = compiled.rest_shape(face_model, face)
+    rest = compiled.rest.of(face_model, face)
     if rest[0].requires_grad:
         return None
     topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
