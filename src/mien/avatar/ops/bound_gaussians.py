@@ -42,7 +42,7 @@ def pose_bound_gaussians(
     prepared = prepare_posing(face_model, face, store)
     if prepared is None:
         posed = _posed_on_gpu(face_model, face, store, sh, in_head)
-        return posed or pose_bound_gaussians_reference(face_model, face, store, sh, in_head)
+        return pose_bound_gaussians_reference(face_model, face, store, sh, in_head) if posed is None else posed
     data, topology, inputs = prepared
     means, quats, scales, opacities, *head = _BoundGaussians.apply(data, topology, in_head, *inputs)
     return Gaussians(means, quats, scales, opacities, sh, *head)
