@@ -178,11 +178,11 @@ def test_posed_and_bound_gaussians(like: Tensor, n: int, in_head: bool, turn: fl
         def posed(own: dict[str, Tensor]) -> list[Tensor | None]:
             face_of = replace(face, **{name: own[name] for name in moving})
             found = function(model, face_of, own, numbers(like, n, 1, 3), in_head)
-            axes = matrix_from_quaternion(found.quats[0]) * found.scales[0][:, None]
+            axes = matrix_from_quaternion(found.quats) * found.scales[:, None]
             squares = (axes @ axes.mT)[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
             if found.covariances is not None:
-                assert_close(squares, found.covariances[0])
-                squares = found.covariances[0]
+                assert_close(squares, found.covariances)
+                squares = found.covariances
             # In units in which gradients of the face are about 1.
             return [found.means, 1e3 * squares, found.opacities, found.T_world_local]
 

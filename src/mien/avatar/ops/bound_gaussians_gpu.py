@@ -34,7 +34,7 @@ def pose_bound_gaussians(
     means, covariances, opacities, quats, scales = bind_gaussians(
         vertices, face_model.faces, store["face_index"], *local
     )
-    return Gaussians(means, quats, scales, opacities, sh, pose if in_head else None, covariances)
+    return Gaussians(means, quats, scales, opacities, sh, pose if in_head else None, covariances).timestep(0)
 
 
 def bind_gaussians(
