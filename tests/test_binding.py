@@ -189,7 +189,7 @@ def test_what_is_carried_stays_where_it_is_in_every_face() -> None:
         store["means"].normal_(std=0.2)
     none = torch.zeros(count, dtype=torch.bool)
     prior = SurfacePrior(torch.zeros(count), colors=torch.full((count, 3), 0.7), filled_in=none, carrier=top)
-    before = avatar.pose(avatar.subject).gaussians.means[0, low]
+    before = avatar.pose(avatar.subject).gaussians.means[low]
     with torch.no_grad():
         store["offset_basis"].normal_()
     lost = surface.carry(low, prior)
@@ -202,7 +202,7 @@ def test_what_is_carried_stays_where_it_is_in_every_face() -> None:
     assert surface.triangles()[-6:].tolist() == [top] * 6
     for face in (avatar.subject, *(toy_face(5)[timestep] for timestep in range(5))):
         # The toy's jaw moves its crown by micrometres, and the way to the chin is long.
-        torch.testing.assert_close(avatar.pose(face).gaussians.means[0, -6:], before, atol=2e-4, rtol=0)
+        torch.testing.assert_close(avatar.pose(face).gaussians.means[-6:], before, atol=2e-4, rtol=0)
 
 
 def test_a_rigid_part_is_many_gaussians_beside_each_other(anny: FaceModel, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,11 +78,11 @@ def test_surfels_cover_equal_areas_and_follow_offsets_exactly() -> None:
     posed = avatar.pose(face)
     corners = (model.rest_vertices(face) + posed.aux["offsets"])[model.faces]
     surfels = Surfels(bound, len(model.faces), model.template)
-    torch.testing.assert_close(posed.gaussians.means[0], surfels.at_corners(corners), atol=1e-6, rtol=0)
+    torch.testing.assert_close(posed.gaussians.means, surfels.at_corners(corners), atol=1e-6, rtol=0)
     # A surfel's covariance is that of its part of the triangle, twice and a half as wide along each axis.
     parts = (corners - corners.mean(1, keepdim=True))[bound] * surfels.shares()[:, None, None]
     expected = OVERLAP**2 * parts.transpose(1, 2) @ parts / 12
-    turns, scales = matrix_from_quaternion(posed.gaussians.quats[0]), posed.gaussians.scales[0]
+    turns, scales = matrix_from_quaternion(posed.gaussians.quats), posed.gaussians.scales
     found = turns @ torch.diag_embed((scales * torch.tensor([1, 0, 1])) ** 2) @ turns.transpose(1, 2)
     torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-3)
 

@@ -142,7 +142,10 @@ class Avatar(nn.Module, ABC):
 
     @abstractmethod
     def pose(self, face: FaceParams, progress: Progress = TRAINED) -> Posed:
-        """The Gaussians of some timesteps, as a batch. Differentiable in `face` and in the avatar's parameters."""
+        """The Gaussians of some timesteps, as a batch, or of one without a batch axis.
+
+        Differentiable in `face` and in the avatar's parameters.
+        """
 
     @abstractmethod
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
