@@ -33,7 +33,8 @@ const Exchange& exchange() {
     const nb::object table = nb::module_::import_("torch").attr("Tensor").attr("__dlpack_c_exchange_api__");
     const auto* const found = static_cast<const Exchange*>(PyCapsule_GetPointer(table.ptr(), "dlpack_exchange_api"));
     if (!found) throw nb::python_error();
-    if (found->major != 1 || !found->adopt || !found->look_at) throw std::runtime_error("PyTorch's DLPack is of another version");
+    if (found->major != 1 || !found->adopt || !found->look_at)
+      throw std::runtime_error("PyTorch's DLPack is of another version");
     return found;
   }();
   return *one;

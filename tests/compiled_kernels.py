@@ -49,8 +49,11 @@ def launch(kernel: Any, programs: int, *arguments: Any, **named: Any) -> None:
 
 
 def main() -> None:
-    """Take one step on `meta` of each of three trainings, and cover Gaussians, as footage of a mouth does."""
+    """Take one step on `meta` of each of three trainings, cover Gaussians, as footage of a mouth does, and move heads
+    and cameras."""
     mien.kernels.launch = launch  # before the files of kernels take it
+    from mien.face.posing_gpu import head_poses
+    from mien.render.around_gsplat import view_directions
     from mien.training import PRESETS
     from mien.training.training_gpu import covered
     from test_device_stalls import LONG, default, pretend, steps, without_features
@@ -67,6 +70,8 @@ def main() -> None:
     rows = torch.zeros(5, dtype=torch.long, device="meta")
     sh, opacities = covered(like, like[:, 0, 0], rows.bool(), rows, (0.1, 0.2, 0.3))
     (sh.sum() + opacities.sum()).backward()
+    turns, viewmat = like[:, 0], torch.zeros(4, 4, device="meta", requires_grad=True)
+    (head_poses(turns, turns).sum() + view_directions(turns, viewmat).sum()).backward()
 
 
 if __name__ == "__main__":

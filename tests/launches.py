@@ -72,7 +72,7 @@ def pin(tensor: Tensor) -> Tensor:
 def place() -> str:
     """Return the innermost function of mien that runs, or that made the node whose backward pass runs."""
     frames = [frame for frame in traceback.extract_stack() if "/src/mien/" in frame.filename]
-    node = torch._C._current_autograd_node()
+    node: Any = torch._C._current_autograd_node()
     if node is not None and not (frames and frames[-1].name == "backward"):
         lines = [line for line in node.metadata.get("traceback_", []) if "/src/mien/" in line]
         if lines:
@@ -88,8 +88,8 @@ class _Nothing(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, shapes: tuple[tuple[int, ...], ...], *inputs: Tensor) -> Any:
         ctx.save_for_backward(*inputs)
-        made = tuple(torch.empty(shape, device="meta") for shape in shapes)
-        return made if len(made) > 1 else made[0]
+        made = [torch.empty(shape, device="meta") for shape in shapes]
+        return tuple(made) if len(made) > 1 else made[0]
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:

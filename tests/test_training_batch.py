@@ -4,6 +4,7 @@ A run that is stopped at any moment and started again ends with the same bytes a
 
 import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,9 +17,12 @@ import torch
 import train_toy
 from forked import ForkServer
 from instruction_sets import by_threads
+from known import known
 from mien.adam import Moments
+from mien.arrays import direct_gradients
 from mien.avatar import Avatar
 from mien.avatar.mono_gaussian_avatar.settings import MonoGaussianAvatarConfig
+from mien.avatar.ops.triangle_penalties import triangle_penalties
 from mien.avatar.settings import PerceptualLoss, Photometric, Progress
 from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
@@ -37,7 +41,7 @@ from mien.training.trainer import start, step
 from plain_settings import plain_mono_gaussian_avatar, plain_run
 from refusals import refuses
 from test_methods import new_avatar
-from toy_scene import toy_camera, toy_data, toy_face, toy_sequence
+from toy_scene import random, toy_camera, toy_data, toy_face, toy_sequence
 
 SMALL = plain_mono_gaussian_avatar(
     points=60, max_points=120, epochs=6, attribute_width=32, deformation_width=16, change_width=16, frames_per_step=4
@@ -328,3 +332,20 @@ def test_threads_do_not_change_a_bit() -> None:
     first, *others = by_threads(trained, (1, 2, 3))
     for name, tensor in first.items():
         assert all(torch.equal(tensor, other[name]) for other in others), name
+
+
+def test_leaves_that_take_their_gradients_themselves_have_the_same() -> None:
+    """Two losses share a leaf, of which one is native; what is no leaf is left to PyTorch."""
+    means, scales, radii = random(100, 3), random(100, 3, seed=1), torch.arange(100, dtype=torch.int32) % 3
+    found = []
+    for way in (nullcontext, direct_gradients):
+        leaves = [means.clone().requires_grad_(), scales.clone().requires_grad_()]
+        pairs = [
+            triangle_penalties(leaves[0], own, radii, (1.0, 0.6), (0.01, 1.0)) for own in (leaves[1], 2 * leaves[1])
+        ]
+        with way():
+            torch.autograd.backward([*pairs[0], *pairs[1], leaves[0].square().sum()])
+        found.append([known(leaf.grad) for leaf in leaves])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other)
+        assert one.any()

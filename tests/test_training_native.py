@@ -2,7 +2,6 @@
 A table has them all. tests/test_feature_network.py, tests/test_point_avatar.py and others hold what is special."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,10 +13,8 @@ from torch import Tensor
 import test_feature_network as features
 import test_point_avatar as points
 from instruction_sets import by_threads
-from known import known
 from mien import _native
 from mien.adam import FactoredGradient, FactoredMoments, FactoredTerm
-from mien.arrays import direct_gradients
 from mien.avatar.avatar import ParameterGroup
 from mien.avatar.ops import changed_gaussians as changing
 from mien.avatar.ops.activation import sigmoid
@@ -116,11 +113,11 @@ def color_inputs(size: tuple[int, int]) -> Tensors:
     return [image, picture, random(*size, seed=2) > 0]
 
 
-def color_difference(given: Tensors, native: bool, counted: bool) -> Tensors:
+def color_difference(given: Tensors, native: bool) -> Tensors:
     image = given[0].clone().requires_grad_()
     loss = color_loss if native else color_loss_reference
-    own = 2 * loss(image, given[1], 0.7, 0.1, given[2]) if counted else loss(image, given[1], 0.7)
-    return [own.detach(), *torch.autograd.grad(own, image)]
+    own = (loss(image, given[1], 0.7), 2 * loss(image, given[1], 0.7, 0.1, given[2]))
+    return [*(one.detach() for one in own), *(torch.autograd.grad(one, image)[0] for one in own)]
 
 
 def mean_square(given: Tensors, native: bool) -> Tensors:
@@ -317,9 +314,7 @@ KERNELS = {
     "published": Kernel(published_inputs, published, ((1, 1, 0), (16, 1, 3), (19, 3, 0), (32, 2, 4)), (32, 1, 4),
                         near(1e-5, 1e-6)),
     "observed": Kernel(observed_inputs, observed, COUNTS, 20_000, near(1.3e-6, 1e-5)),
-    "colors": Kernel(color_inputs, partial(color_difference, counted=False), PICTURES, (200, 301), near(1e-5, 1e-7)),
-    "counted colors": Kernel(
-        color_inputs, partial(color_difference, counted=True), PICTURES, (200, 301), near(1e-5, 1e-7)),
+    "colors": Kernel(color_inputs, color_difference, PICTURES, (200, 301), near(1e-5, 1e-7)),
     "alpha": Kernel(opacity_inputs, opacity_loss, PICTURES, (200, 301), near(1e-5, 1e-7)),
     "squares": Kernel(lambda size: [random(*size, 3), (255 * random(*size, 3).sigmoid().flip(0)).to(torch.uint8)],
                       mean_square, ((0, 5), (1, 1), (40, 130)), (200, 301), near(1e-5, 0)),
@@ -403,20 +398,3 @@ def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
         rows, columns = values.nonzero().T
         left, top = int(columns.min()), int(rows.min())
         assert _native.box_of_nonzero(values) == (left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)
-
-
-def test_leaves_that_take_their_gradients_themselves_have_the_same() -> None:
-    """Two losses share a leaf, of which one is native; what is no leaf is left to PyTorch."""
-    means, scales, radii = penalty_inputs(100)
-    found = []
-    for way in (nullcontext, direct_gradients):
-        leaves = [means.clone().requires_grad_(), scales.clone().requires_grad_()]
-        pairs = [
-            triangle_penalties(leaves[0], own, radii, (1.0, 0.6), (0.01, 1.0)) for own in (leaves[1], 2 * leaves[1])
-        ]
-        with way():
-            torch.autograd.backward([*pairs[0], *pairs[1], leaves[0].square().sum()])
-        found.append([known(leaf.grad) for leaf in leaves])
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one, other)
-        assert one.any()

@@ -32,7 +32,7 @@ class Run:
 
     mien batch status DIR: how far each row is, what failed and why, and when it will be done.
 
-    mien batch PEOPLE --paper examples/papers/headgas.toml --out DIR: a paper's table, with our figures beside its own.
+    mien batch PEOPLE --paper examples/papers/FILE.toml --out DIR: a paper's table, with our figures beside its own.
     PEOPLE is a folder with a video, or a dataset's folder, for each subject. Each method of the file is trained on each
     subject with the paper's settings and scored, which takes days. --subjects 1 --steps 300 --preset draft is a trial.
     """

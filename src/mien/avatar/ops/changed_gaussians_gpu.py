@@ -87,6 +87,7 @@ class _Changed(torch.autograd.Function):
             of_sh = torch.nn.functional.pad(of_sh, (0, 0, 0, sizes["WIDTH"] - 1))
         if of_features is None:
             return None, None, by[0], by[1], of_sh, *of_bases, None, None, None, None
+        assert of_weights is not None
         total = of_weights.sum(0)
         if ctx.neutral.is_leaf and ctx.neutral.grad is not None:
             # It may share the memory of an earlier term, and autograd adds to it in place.

@@ -32,7 +32,7 @@ _SHIFT = 5.0
 """Weight of a shift of the head by a metre, relative to a turn with a sine of 1."""
 MARGIN = 0.1
 """How far activations can get beyond what training saw along them, as a share of it."""
-_LEAST_SEEN = 1e-6
+LEAST_SEEN = 1e-6
 """Smallest product with what training saw. Activations of which it saw nothing come to almost 0."""
 
 
@@ -101,7 +101,7 @@ class ExpressionActivations(nn.Module):
         if on_gpu(self.rest, *parts):
             from mien.avatar.ops.expression_changes_gpu import activation_table
 
-            return activation_table(self, face, MARGIN, _LEAST_SEEN)
+            return activation_table(self, face, MARGIN, LEAST_SEEN)
         if not is_native(self.rest, *parts):
             return self.reference(face)
         buffers = [*self.buffers()]
@@ -200,7 +200,7 @@ def within_seen(values: Float[Tensor, "b r"], seen: Float[Tensor, "s ... r"]) ->
     if not len(seen):
         return values
     products = torch.einsum("br,sbr->bs", values, seen) if seen.ndim == 3 else values @ seen.T
-    furthest = products.amax(-1, keepdim=True).clamp_min(_LEAST_SEEN)
+    furthest = products.amax(-1, keepdim=True).clamp_min(LEAST_SEEN)
     ratio = values.square().sum(-1, keepdim=True) / furthest
     over = (ratio - 1).clamp_min(0)
     shortened = (1 + MARGIN * over / (MARGIN + over)) / ratio.clamp_min(1)
