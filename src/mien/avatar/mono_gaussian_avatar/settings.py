@@ -91,7 +91,7 @@ _PAPER = {
 }
 """The paper's settings (docs/paper_preset.md)."""
 _CPU_FRAMES = 30
-"""Frames of an epoch in `paper-cpu`, with which a run takes about an hour on one core."""
+"""Frames of an epoch in `paper-cpu`, with which a run takes about an hour and a half on one core."""
 
 PRESETS: dict[str, Differences] = {
     "paper": {"method": _PAPER, "settings": {"steps": _PAPER_EPOCHS * _PAPER_FRAMES}},
