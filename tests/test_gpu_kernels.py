@@ -28,6 +28,7 @@ from mien.avatar.ops.feature_network import Layers
 from mien.avatar.ops.surface_limits import RATIO, keep_on_surface_reference, limits_of_triangles, pull_colors
 from mien.avatar.ops.triangle_penalties import triangle_penalties_reference
 from mien.face import FaceModel
+from mien.kernels import VARIABLE, on_gpu
 from mien.rotation import matrix_from_quaternion
 from mien.training.adam import FactoredUpdate, factored_update_reference
 from mien.training.density_control.gradient import observe_reference
@@ -326,3 +327,9 @@ def test_kernels_compile_for_a_gpu() -> None:
     }
     assert kernels - names == set()
     assert len(kernels) > 20
+
+
+def test_a_variable_switches_kernels_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    for value, expected in (("1", True), ("0", False)):
+        monkeypatch.setenv(VARIABLE, value)
+        assert on_gpu(torch.zeros(3, device="meta")) is expected

@@ -5,6 +5,7 @@ which have no values, take the same path: tests count the launches of a step wit
 kernels on a processor (`TRITON_INTERPRET=1`), in any dtype.
 """
 
+import os
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
@@ -12,13 +13,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+VARIABLE = "MIEN_GPU_KERNELS"
+"""If it is 0, a GPU computes all in plain PyTorch."""
+
 
 def on_gpu(*tensors: Tensor) -> bool:
     """Whether kernels can compute with these tensors: float32, or integers, on a GPU with Triton."""
     return all(
         tensor.device.type in ("cuda", "meta") and (tensor.dtype is torch.float32 or not tensor.is_floating_point())
         for tensor in tensors
-    ) and (bool(tensors) and _has_triton())
+    ) and (bool(tensors) and os.environ.get(VARIABLE) != "0" and _has_triton())
 
 
 def launch(kernel: Any, programs: int, *arguments: Any, **constants: Any) -> None:
