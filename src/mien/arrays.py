@@ -106,7 +106,7 @@ def left_to_autograd(inputs: Sequence[Tensor | None], gradients: Sequence[Tensor
 
 
 ONE = torch.ones(())
-"""What `own_derivative` gives to all losses on the CPU."""
+"""The tensor that `own_derivative` gives to all losses on the CPU."""
 
 
 def own_derivative(loss: Float[Tensor, ""]) -> Tensor | None:

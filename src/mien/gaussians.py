@@ -27,8 +27,8 @@ class Gaussians:
     T_world_local: Float[Tensor, "... 4 4"] | None = None
     """Rigid pose of the local frame; None means identity. Renderers move the camera by it, not the Gaussians."""
     covariances: Float[Tensor, "... n 6"] | None = None
-    """What `quats` and `scales` say as xx, xy, xz, yy, yz and zz, in square metres. Kernels of a GPU pose these, and
-    the renderer there takes them. If they are given, gradients of shapes go through them alone."""
+    """The shapes that `quats` and `scales` describe, as xx, xy, xz, yy, yz and zz in square metres. Kernels of a GPU
+    pose these, and the renderer there takes them. If they are given, gradients of shapes go through them alone."""
 
     def __len__(self) -> int:
         """The number of Gaussians, n."""

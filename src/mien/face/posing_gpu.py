@@ -210,7 +210,7 @@ def _turn(
 @no_type_check
 @triton.jit
 def _derived(axis: tl.constexpr, expression, basis, k, e, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr):
-    """What the expression says of one number of each joint."""
+    """Add up one number of each joint over the expression."""
     joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
     at, there = (number[:, None] * k + joint[None, :]) * 3 + axis, (number < e)[:, None] & (joint < k)[None, :]
     own = tl.load(expression + number, mask=number < e, other=0.0)

@@ -1,4 +1,4 @@
-"""What stands between mien's Gaussians and gsplat's kernels, in kernels of its own: each is one launch."""
+"""Kernels between mien's Gaussians and gsplat's own kernels: each is one launch."""
 
 from typing import Any, no_type_check
 

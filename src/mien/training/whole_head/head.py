@@ -38,7 +38,7 @@ _BOUND_EVERY = 250  # the same, from one time that Gaussians are bound anew to t
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is found on the CPU before the avatar moves to its device, so that nothing has to come back."""
+    """Facts that are found on the CPU before the avatar moves to its device, so that nothing has to come back."""
 
     side_views: SideViews | None
     """They stay on the CPU."""
