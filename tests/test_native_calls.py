@@ -247,7 +247,6 @@ CASES: dict[str, tuple[Callable[[], Any], str, str]] = {
     "memory for several views": (memory_for_several_views, MEMORY, ""),
     "tensors that no memory holds": (lambda: _native.recycled([2**62, 8]), MEMORY, ""),
     "empty tensors": (lambda: tuple(_native.recycled([0, 3]).shape), "accepted", "(0, 3)"),
-    "what is no tensor": (lambda: _native.unpacked(None, np.zeros(3, F32)), TYPE, "the core takes tensors"),
     "functions without a valid call": (functions_without_a_valid_call, "accepted", "none"),
     "threads that cannot be had": (threads_that_cannot_be_had, "accepted", "fewer"),
 }  # fmt: skip

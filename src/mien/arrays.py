@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils.dlpack import to_dlpack
 
 from mien import _native
 from mien.kernels import on_gpu
@@ -18,10 +19,9 @@ _Operation = TypeVar("_Operation", bound=Callable[..., Any])
 
 
 def recycled(*shape: int) -> Tensor:
-    """An uninitialised float32 tensor on the CPU, with at most four axes. A large one gets memory that was in use.
+    """An uninitialised float32 tensor on the CPU. A large one gets memory that was in use before.
 
-    The kernel clears fresh pages, and at 2048x2048 that takes longer than drawing the picture. PyTorch's own `empty`
-    takes twice as long for a small one.
+    The kernel clears fresh pages, and at 2048x2048 that takes longer than drawing the picture.
     """
     return _native.recycled(shape)
 
@@ -63,11 +63,11 @@ def native(reference: Callable[..., Any], *, gpu: str | None = None) -> Callable
 def unpacked(*tensors: Tensor | None) -> list[Any]:
     """CPU tensors in the form in which the core takes them, whether they need a gradient or not; None stays None.
 
-    The core would otherwise call `__dlpack__` of each tensor itself. That takes ten times as long, 2 us, records an
-    operator, and happens a hundred times per training step. Use it only for functions with a single signature: each
-    capsule can be consumed only once, so a second overload could not read it.
+    The core would otherwise call `__dlpack__` of each tensor itself. That takes ten times as long, 2 us, and happens a
+    hundred times per training step. Use it only for functions with a single signature: each capsule can be consumed
+    only once, so a second overload could not read it.
     """
-    return _native.unpacked(*tensors)
+    return [None if tensor is None else to_dlpack(tensor) for tensor in tensors]
 
 
 @dataclass

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 
 Rng = np.random.Generator
 Arguments = list[Any]
@@ -358,7 +357,6 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "thread_count": lambda c: [],
     "triangle_penalties": lambda c: c.given(
         (1.0, 0.6), (0.01, 1.0), "n 3", "n 3", "<3 n:i4", "=n 3", "=n 3", "=", "="),
-    "unpacked": lambda c: [torch.zeros(c.size("n"), 3), None],
 }  # fmt: skip
 """Name of a native function -> the parts that make the arguments of a valid call."""
 

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import types
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -39,7 +40,11 @@ STRANGERS = ("ride_backward", "rasterize_views_backward", "align_mesh", "pose_fa
 
 
 def load(path: str) -> Any:
-    """Load the native module from a file, without the package around it."""
+    """Load the native module from a file, without the package around it. Stand-ins replace its imports from torch."""
+    dlpack = types.ModuleType("torch.utils.dlpack")
+    dlpack.__dict__["from_dlpack"] = lambda exported: exported
+    sys.modules |= {"torch": types.ModuleType("torch"), "torch.utils": types.ModuleType("torch.utils")}
+    sys.modules["torch.utils.dlpack"] = dlpack
     spec = importlib.util.spec_from_file_location("_native", path)
     assert spec is not None
     assert spec.loader is not None
