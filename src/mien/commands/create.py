@@ -105,6 +105,7 @@ class Command:
         from mien.pipeline.capture import run_capture_stage
         from mien.pipeline.create import name_next_commands, show_film, show_page
         from mien.pipeline.evaluate import run_evaluation_stage
+        from mien.pipeline.stage_times import FILE_NAME, StageTimes
         from mien.pipeline.track import run_tracking_stage, show_trackings
         from mien.pipeline.train import run_training_stage
         from mien.training.settings import check_held_out
@@ -113,7 +114,9 @@ class Command:
         method, settings = self.options.method_config(), self.options.settings()
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         self._check_files(workspace, run)
-        with stages("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out) as begin:
+        times = StageTimes(workspace.root / FILE_NAME)
+        named = ("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out)
+        with stages(*named) as tell, times.one_by_one(tell) as begin:
             begin("capture")
             captured = run_capture_stage(workspace, self.videos, self.name, self.calibration, self.capture)
             check_held_out(captured, settings)
@@ -144,7 +147,7 @@ class Command:
                 # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
                 run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
         show_film(workspace, run)
-        say(f"Done in {time.monotonic() - began:.0f} s.")
+        say(f"Done in {time.monotonic() - began:.0f} s. Stages: {times.told() or 'none took a second'}.")
         name_next_commands(workspace, run)
 
     def aligns(self, several_cameras: bool) -> bool:

@@ -1,0 +1,82 @@
+"""Seconds and cores of each stage of a command, kept with the workspace."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from mien.disk.files import read_json, write_json
+from mien.errors import UserError
+
+FILE_NAME = "stages.json"
+_FORMAT, _VERSION = "mien.stage_times", 1
+_NOTHING_TO_DO = 0.1  # share of the earlier time
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """What one stage took."""
+
+    seconds: float
+    """Time that passed, in seconds."""
+    processor: float
+    """Processor time of all threads, and of child processes that have ended, in seconds."""
+
+    @property
+    def cores(self) -> float:
+        """The number of cores in use, on average."""
+        return self.processor / self.seconds if self.seconds else 0.0
+
+
+class StageTimes:
+    """The time of each stage by name, kept in a file.
+
+    A stage that takes less than a tenth of its earlier time had nothing to do, and the earlier time stays.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            content = read_json(path, _FORMAT, _VERSION)["stages"]
+            self.stages = {name: StageTime(**own) for name, own in content.items()}
+        except (UserError, TypeError, AttributeError, KeyError):  # it is only measured anew
+            self.stages: dict[str, StageTime] = {}
+
+    @contextmanager
+    def measured(self, stage: str) -> Iterator[None]:
+        """Measure the time inside the context."""
+        began, processor = time.monotonic(), _processor_seconds()
+        yield
+        spent = StageTime(round(time.monotonic() - began, 1), round(_processor_seconds() - processor, 1))
+        if stage in self.stages and spent.seconds < _NOTHING_TO_DO * self.stages[stage].seconds:
+            return
+        self.stages[stage] = spent
+        stages = {name: {"seconds": own.seconds, "processor": own.processor} for name, own in self.stages.items()}
+        write_json(self._path, _FORMAT, _VERSION, {"stages": stages})
+
+    @contextmanager
+    def one_by_one(self, begin: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+        """Give `begin`, which measures each stage until the next one begins."""
+        with ExitStack() as running:
+
+            def next_stage(name: str) -> None:
+                running.close()
+                begin(name)
+                running.enter_context(self.measured(name))
+
+            yield next_stage
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds by stage."""
+        return {name: own.seconds for name, own in self.stages.items()}
+
+    def told(self) -> str:
+        """What took a second or more, for people: "tracking 120 s on 1.8 cores, training 364 s on 1.4 cores"."""
+        long = {name: own for name, own in self.stages.items() if own.seconds >= 1}
+        return ", ".join(f"{name} {own.seconds:.0f} s on {own.cores:.1f} cores" for name, own in long.items())
+
+
+def _processor_seconds() -> float:
+    return sum(os.times()[:4])
