@@ -3,6 +3,7 @@
 import itertools
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
-from mien.lab.benchmarking import method_steps, step_parts, train_step
+from mien.lab.benchmarking import method_steps, scaling, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, thread_counts, time_function
 from mien.training.trainer import step
@@ -51,18 +52,39 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 
 
 def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
-    monkeypatch.setattr(render_benchmark, "SIZES", ((40, 30), (32, 32)))
+    monkeypatch.setattr(scaling, "COUNTS", (5, 20))
+    monkeypatch.setattr(scaling, "SIZES", ((40, 30), (32, 32)))
+    monkeypatch.setattr(scaling, "COUNT", 30)
+    small = train_step.training_case(load_face_model(), 2_000, 48, 40)
+    monkeypatch.setattr(scaling, "default_case", lambda face_model: (*small, train_step.SETTINGS))
     chart = tmp_path / "chart.svg"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gflops"] > 0
     rows = [BenchmarkRow(**row) for row in shown["rows"]]
+    drawn, others = ([row for row in rows if row.name.startswith("rasterize_f") == which] for which in (True, False))
     wanted = itertools.product(((40, 30), (32, 32)), (5, 20), thread_counts())
-    assert {((row.width, row.height), row.gaussians, row.threads) for row in rows} == set(wanted)
+    assert {((row.width, row.height), row.gaussians, row.threads) for row in drawn} == set(wanted)
+    names = ["train_step_default", *(f"rasterize_{pictures}_at_once" for pictures in (1, 2, 4, 8))]
+    assert {row.name for row in others} == set(names)
+    assert {row.threads for row in others} >= set(thread_counts())
     assert all(0 < row.min_ms <= row.median_ms for row in rows)
-    assert all(words in chart.read_text() for words in ("rasterize forward, 1 thread", "40x30", "32x32"))
-    # Instruction sets are compared, and restored.
+    titles = ("rasterize forward, 1 thread", "40x30", "32x32", "30 Gaussians by threads", "rasterize 8 at once")
+    assert all(words in chart.read_text() for words in titles)
+
+
+def test_the_share_that_does_not_scale_is_amdahls() -> None:
+    def row(name: str, threads: int, ms: float) -> BenchmarkRow:
+        return replace(benchmark_row(name, 9, (64, 48), Timing(ms, ms, ms)), threads=threads)
+
+    rows = [row("whole", 1, 8.0), row("whole", 2, 5.0), row("whole", 4, 3.5), row("none", 1, 8.0), row("none", 4, 2.0)]
+    first, second = scaling.shares_that_do_not_scale([*rows, row("alone", 1, 8.0)])
+    assert "whole" in first
+    assert "25 % does not scale (2.29 times as fast with 4 threads)" in first
+    assert " 0 % does not scale (4.00 times" in second
+
+
+def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_benchmark, "COUNTS", ())
     monkeypatch.setattr(
         render_benchmark, "head_scene", lambda *_, head_scene=render_benchmark.head_scene: head_scene(9, 8, 8)
@@ -103,6 +125,8 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = step_parts.format_parts(rows)
     assert "a step, " in shown
     assert shown.count("ride_changes_backward") == 1
+    drawn = sum(row.ms for row in rows if row.operation in ("rasterize_views", "rasterize_views_backward"))
+    assert shown.endswith(f"{sum(row.ms for row in rows) / drawn:.2f} times")
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
         for _ in range(50):
             step(state, data, settings)

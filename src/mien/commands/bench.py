@@ -57,7 +57,7 @@ class Render(_Timed):
 
 @dataclass(frozen=True)
 class Scaling(_Timed):
-    """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
+    """Measure how drawing and training scale, by Gaussians, size, pictures and threads, and which share does not."""
 
     plot: Path | None = None
     """File for a chart, .svg (default: no chart)."""
@@ -73,9 +73,11 @@ class Scaling(_Timed):
 
     def run(self) -> None:
         """Measure and print the rows, then draw the chart."""
-        from mien.lab.benchmarking.render import scaling_suite, write_scaling_chart
+        from mien.lab.benchmarking.scaling import scaling_suite, shares_that_do_not_scale, write_scaling_chart
 
         rows = show_rows(scaling_suite(self.seconds), self.as_json)
+        if not self.as_json:
+            show("\n".join(shares_that_do_not_scale(rows)))
         if self.plot is not None:
             write_scaling_chart(self.plot, rows)
 

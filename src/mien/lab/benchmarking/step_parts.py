@@ -117,6 +117,9 @@ def format_parts(rows: list[PartRow]) -> str:
         lines.append(f"  {phase:42} {ms:8.2f} ms {100 * ms / whole:5.1f} %")
         own = sorted((row for row in rows if row.phase == phase), key=lambda row: -row.ms)
         lines += [f"    {row.operation:40} {row.ms:8.2f} ms {100 * row.ms / whole:5.1f} %" for row in own]
+    drawn = sum(row.ms for row in rows if row.operation.startswith("rasterize_views"))
+    if drawn:
+        lines.append(f"{'a step over its rasterizer':44} {whole / drawn:8.2f} times")
     return "\n".join(lines)
 
 
