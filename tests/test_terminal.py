@@ -174,6 +174,7 @@ def test_stages_are_told(capsys) -> None:
 def test_each_stage_has_its_seconds_and_cores_and_one_with_nothing_to_do_keeps_them(monkeypatch, tmp_path) -> None:
     clock, processor = Clock(), [0.0]
     monkeypatch.setattr(stage_times, "time", clock)
+    monkeypatch.setattr(stage_times, "peak_memory_mb", lambda: 2000.0)
     monkeypatch.setattr(stage_times.os, "times", lambda: (processor[0] / 2, 0.0, processor[0] / 2, 0.0, 0.0))
     for capture, training in ((10.0, 20.0), (0.5, 15.0)):
         times = StageTimes(tmp_path / "stages.json")
@@ -183,7 +184,7 @@ def test_each_stage_has_its_seconds_and_cores_and_one_with_nothing_to_do_keeps_t
                 clock.now += seconds
                 processor[0] += 1.5 * seconds
     assert StageTimes(tmp_path / "stages.json").seconds() == {"capture": 10.0, "training": 15.0}
-    assert times.told() == "capture 10 s on 1.5 cores, training 15 s on 1.5 cores"
+    assert times.told() == "capture 10 s on 1.5 cores, training 15 s on 1.5 cores; 2.1 GB of memory"
 
 
 def test_times_that_cannot_be_read_are_measured_anew(tmp_path) -> None:

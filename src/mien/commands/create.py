@@ -147,7 +147,7 @@ class Command:
                 # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
                 run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
         show_film(workspace, run)
-        say(f"Done in {time.monotonic() - began:.0f} s. Stages: {times.told() or 'none took a second'}.")
+        say(f"Done in {time.monotonic() - began:.0f} s. Stages: {times.told()}.")
         name_next_commands(workspace, run)
 
     def aligns(self, several_cameras: bool) -> bool:

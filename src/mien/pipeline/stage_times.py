@@ -1,14 +1,15 @@
-"""Seconds and cores of each stage of a command, kept with the workspace."""
+"""Seconds, cores and memory of each stage of a command, kept with the workspace."""
 
 import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from mien.disk.files import read_json, write_json
 from mien.errors import UserError
+from mien.machine.system import peak_memory_mb
 
 FILE_NAME = "stages.json"
 _FORMAT, _VERSION = "mien.stage_times", 1
@@ -23,6 +24,8 @@ class StageTime:
     """Time that passed, in seconds."""
     processor: float
     """Processor time of all threads, and of child processes that have ended, in seconds."""
+    memory: float = 0.0
+    """The most memory that the process has taken by the end of the stage, in MiB."""
 
     @property
     def cores(self) -> float:
@@ -49,12 +52,13 @@ class StageTimes:
         """Measure the time inside the context."""
         began, processor = time.monotonic(), _processor_seconds()
         yield
-        spent = StageTime(round(time.monotonic() - began, 1), round(_processor_seconds() - processor, 1))
+        spent = StageTime(
+            round(time.monotonic() - began, 1), round(_processor_seconds() - processor, 1), round(peak_memory_mb(), 0)
+        )
         if stage in self.stages and spent.seconds < _NOTHING_TO_DO * self.stages[stage].seconds:
             return
         self.stages[stage] = spent
-        stages = {name: {"seconds": own.seconds, "processor": own.processor} for name, own in self.stages.items()}
-        write_json(self._path, _FORMAT, _VERSION, {"stages": stages})
+        write_json(self._path, _FORMAT, _VERSION, {"stages": {key: asdict(own) for key, own in self.stages.items()}})
 
     @contextmanager
     def one_by_one(self, begin: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
@@ -73,9 +77,11 @@ class StageTimes:
         return {name: own.seconds for name, own in self.stages.items()}
 
     def told(self) -> str:
-        """What took a second or more, for people: "tracking 120 s on 1.8 cores, training 364 s on 1.4 cores"."""
+        """What took a second or more, for people: "tracking 120 s on 1.8 cores, training 364 s on 1.4"."""
         long = {name: own for name, own in self.stages.items() if own.seconds >= 1}
-        return ", ".join(f"{name} {own.seconds:.0f} s on {own.cores:.1f} cores" for name, own in long.items())
+        each = ", ".join(f"{name} {own.seconds:.0f} s on {own.cores:.1f} cores" for name, own in long.items())
+        most = max((own.memory for own in self.stages.values()), default=0.0)
+        return each + (f"; {most * 2**20 / 1e9:.1f} GB of memory" if most else "")
 
 
 def _processor_seconds() -> float:
