@@ -21,7 +21,7 @@ from mien.avatar.ops.point_network import Activation, Layer, PlannedLayer, Rows,
 from mien.avatar.ops.points import positional_encoding
 from mien.kernels import on_gpu
 
-_SKINNING_SHARPNESS = 20.0
+SKINNING_SHARPNESS = 20.0
 """Factor on the logits of the skinning weights: their softmax has a temperature of 1/20. As published."""
 _SPHERE_RADIUS = 0.6  # radius of the sphere whose distance a network gives at the start. As published
 
@@ -148,7 +148,27 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight, bias))
         offset, moved, logits = outputs.split([3, 3 * len(coefficients), self.skinning.out_features], dim=-1)
         moved = moved.unflatten(-1, (-1, 3)).transpose(0, 1)
-        return offset, moved, (_SKINNING_SHARPNESS * logits).softmax(-1)
+        return offset, moved, (SKINNING_SHARPNESS * logits).softmax(-1)
+
+    def outputs(self, points: Float[Tensor, "n 3"], coefficients: Float[Tensor, "b c"] | None = None) -> Tensor:
+        """Offsets, sums of directions, and logits of skinning weights of points on a GPU.
+
+        Without coefficients, each number of an offset and its directions lie side by side.
+        """
+        from mien.avatar.ops.point_network_gpu import packed, packed_network, structure_of, summed_directions
+
+        plan = self.plan()
+        structure = structure_of(3, plan)
+        parameters = packed(plan, structure)
+        if coefficients is not None:
+            parameters, structure = summed_directions(parameters, coefficients, structure)
+        return packed_network(points, parameters, structure)
+
+    def plan(self) -> list[PlannedLayer]:
+        """The layers of `whole` for a GPU."""
+        trunk = [PlannedLayer([Rows(_as_linear(layer))], "softplus") for layer in self.trunk]
+        last = [Rows(self.directions, self.hidden.out_features), Rows(self.skinning)]
+        return [*trunk, PlannedLayer([Rows(_as_linear(self.hidden))], "softplus"), PlannedLayer(last, extra=len(trunk))]
 
     def whole(self, points: Float[Tensor, "n 3"]) -> Deformation:
         """Everything about some points, with every direction."""
@@ -157,7 +177,7 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight.flatten(0, 1), bias.flatten()))
         directions, logits = outputs.split([3 * sum(widths), self.skinning.out_features], dim=-1)
         offset, expression, pose = directions.unflatten(-1, (3, -1)).split(widths, dim=-1)
-        return Deformation(offset[..., 0], expression, pose, (_SKINNING_SHARPNESS * logits).softmax(-1))
+        return Deformation(offset[..., 0], expression, pose, (SKINNING_SHARPNESS * logits).softmax(-1))
 
     def _directions(self) -> tuple[Float[Tensor, "3 _ w"], Float[Tensor, "3 _"]]:
         return self.directions.weight.unflatten(0, (3, -1)), self.directions.bias.unflatten(0, (3, -1))
@@ -191,7 +211,9 @@ class AttributeChangeNet(nn.Module):
     def plan(self) -> list[PlannedLayer]:
         """The same layers for a GPU, which multiplies none."""
         activations: list[Activation] = ["relu", "relu", "relu" if self.every else "none"]
-        plan = [PlannedLayer([Rows(_as_linear(layer))], own) for layer, own in zip(self.trunk, activations, strict=True)]
+        plan = [
+            PlannedLayer([Rows(_as_linear(layer))], own) for layer, own in zip(self.trunk, activations, strict=True)
+        ]
         width = self.heads[0].out_features
         last = [Rows(_as_linear(output), index * width) for index, output in enumerate(self.outputs)]
         return [*plan, PlannedLayer([Rows(_as_linear(head)) for head in self.heads], "relu"), PlannedLayer(last)]

@@ -249,8 +249,10 @@ def _layer_inputs(inputs, values, n, source: tl.constexpr, VALUES_AT: tl.constex
 @no_type_check
 @triton.jit
 def _product(total, left, row, n, width: tl.constexpr, right, column, columns, across, down, DEPTH: tl.constexpr):
-    """Add left [n, width] @ right to a tile. `across` and `down` are the steps of `right` from column to column and
-    from row to row."""
+    """Add left [n, width] @ right to a tile.
+
+    `across` and `down` are the steps of `right` from column to column and from row to row.
+    """
     for first in range(0, width, DEPTH):
         middle = first + tl.arange(0, DEPTH)
         one = tl.load(
