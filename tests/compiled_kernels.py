@@ -49,7 +49,7 @@ def launch(kernel: Any, programs: int, *arguments: Any, **named: Any) -> None:
 
 
 def main() -> None:
-    """Take one step on `meta` of each of three trainings, cover Gaussians, as footage of a mouth does, and move heads
+    """Take one step on `meta` of each of four trainings, cover Gaussians, as footage of a mouth does, and move heads
     and cameras."""
     mien.kernels.launch = launch  # before the files of kernels take it
     from mien.face.posing_gpu import head_poses
@@ -61,7 +61,7 @@ def main() -> None:
     with pytest.MonkeyPatch.context() as patched:
         pretend(patched)
         trainings = [default()]
-        for method in ("gaussian_avatars", "headgas"):
+        for method in ("gaussian_avatars", "headgas", "mono_gaussian_avatar"):
             paper = PRESETS["paper"]
             trainings.append((paper.config(method), paper.settings_of(method)))
         for config, settings in trainings:

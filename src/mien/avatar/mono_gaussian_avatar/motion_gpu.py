@@ -178,7 +178,7 @@ def _rested(weights, bones, k, x, y, z, BONES: tl.constexpr):
 @no_type_check
 @triton.jit
 def _softmax(logits):
-    raised = tl.exp(logits - tl.max(logits, 1)[:, None])
+    raised = tl.exp(logits - tl.max(tl.where(logits == logits, logits, 0.0), 1)[:, None])
     return raised / tl.sum(raised, 1)[:, None]
 
 
@@ -237,6 +237,7 @@ def _move_backward(
     there, known = row < n, (row < n)[:, None] & (bone < k)[None, :]
     wide = row.to(tl.int64)
     own = tl.load(weights + wide[:, None] * k + bone[None, :], mask=known, other=0.0)
+    own = tl.where((row >= n)[:, None] & (bone == 0)[None, :], 1.0, own)  # Lanes beyond the last point divide, too.
     x, y, z = _vector(means, 3 * wide, there)
     to_x, to_y, to_z = _vector(outputs, wide * width, there)
     rest, left, middle, right = _rested(
@@ -377,7 +378,8 @@ def _nearest(points, outputs, vertices, result, n, v, width, c, BLOCK: tl.conste
         at = first + vertex
         to_x, to_y, to_z = _vector(vertices, 3 * at, at < v)
         across, down, deep = x[:, None] - to_x[None, :], y[:, None] - to_y[None, :], z[:, None] - to_z[None, :]
-        squares = tl.where((at < v)[None, :], across * across + down * down + deep * deep, float("inf"))
+        squares = across * across + down * down + deep * deep
+        squares = tl.where((at < v)[None, :] & (squares == squares), squares, float("inf"))
         lowest = tl.min(squares, 1)
         own = first + tl.argmin(squares, 1)
         nearer = lowest < least

@@ -310,11 +310,10 @@ def _backward(
 ):  # fmt: skip
     """Derivatives by the sums that each layer's activation takes, and by the inputs, which are number 0."""
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    for step in tl.static_range(len(OUTPUTS)):
-        number = len(OUTPUTS) - 1 - step
+    for number in tl.static_range(len(OUTPUTS) - 1, -1, -1):
         if number > 0 or by_inputs is not None:
             width = INPUTS[number]
-            for first in range(0, width, TILE):
+            for first in range(0, INPUTS[number], TILE):
                 column = first + tl.arange(0, TILE)
                 total = tl.zeros([BLOCK, TILE], parameters.dtype.element_ty)
                 for layer in tl.static_range(number, len(OUTPUTS)):
