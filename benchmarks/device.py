@@ -45,7 +45,7 @@ class Clock:
 
 
 Run = Callable[[str, list[str], float], tuple[int, str, str]]
-"""Runs a command under a name for some seconds at most: its exit status, or 124 if they were over, output and errors."""
+"""Runs a command under a name for some seconds at most: its status, or 124 if they were over, output and errors."""
 
 
 def runner(folder: Path) -> Run:

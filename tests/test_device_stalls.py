@@ -83,11 +83,11 @@ def steps(config: MethodConfig, settings: TrainSettings, count: int) -> Iterator
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     state = trainer.start([sequence], face_model, config, settings, META)
     data = toy_data(sequence, settings, META)
-    for _ in range(count):
+    for number in range(count):
         with Constants() as constants, Launches() as launches:
             trainer.step(state, data, settings)
         # The first step moves to a GPU what stays there.
-        assert state.step == 1 or not launches.waits + constants.waits
+        assert number == 0 or not launches.waits + constants.waits
         yield state, launches.count
 
 
@@ -122,10 +122,11 @@ def test_a_round_of_density_waits_once(method: str, monkeypatch: pytest.MonkeyPa
     for module in (gradient, refill):
         monkeypatch.setattr(module, "count_each", counted)
     ((state, _),) = steps(without_features(PRESETS["paper"].config(method)), plain_run(**LONG), 1)
-    posed = state.avatar.pose(state.track.face(0))
+    posed, density = state.avatar.pose(state.track.face(0)), state.density
+    assert density is not None
     with Constants() as constants, Launches() as launches:
         assert any(
-            state.density.adapt(state.avatar.store, posed, Progress(number, 1000, 0, 1.0), torch.Generator)
+            density.adapt(state.avatar.store, posed, Progress(number, 1000, 0, 1.0), torch.Generator)
             for number in range(1000)
         )
     assert not launches.waits + constants.waits

@@ -5,7 +5,7 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -146,6 +146,13 @@ class Avatar(nn.Module, ABC):
 
         Differentiable in `face` and in the avatar's parameters.
         """
+
+    def graph_key(self, progress: Progress) -> Hashable:
+        """The numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`). Or None.
+
+        Such a pose has no side effects, as a factored gradient is one, and gives Gaussians alone.
+        """
+        return None
 
     @abstractmethod
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:

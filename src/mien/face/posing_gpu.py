@@ -409,12 +409,8 @@ def _move_joints_backward(
     rotation, by_rotation = rotation + timestep * 3, by_rotation + timestep * 3
     by_translation, by_pose, given = by_translation + timestep * 3, by_pose + timestep * 16, given + timestep * 12 * k
     of_all = timestep * 12 * (k + 1)
-    local, transforms, by_local, by_transforms = (
-        local + of_all,
-        transforms + of_all,
-        by_local + of_all,
-        by_transforms + of_all,
-    )
+    local, transforms = local + of_all, transforms + of_all
+    by_local, by_transforms = by_local + of_all, by_transforms + of_all
     by_factors += timestep * (e + 9 * given_joints if CORRECTED else e)
     joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
     four = tl.arange(0, 4)

@@ -16,6 +16,7 @@ learns the face model's motion before the first picture (`pretraining`), and eac
 those that the network gives to its position (`own_rate`).
 """
 
+from collections.abc import Hashable
 from dataclasses import replace
 
 import torch
@@ -93,6 +94,10 @@ class MonoGaussianAvatar(FreePoints):
         opacities = sigmoid(raw["opacity_logits"][..., 0])
         sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
         return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
+
+    def graph_key(self, progress: Progress) -> Hashable:
+        """The radius of all points, which changes with the epoch."""
+        return self._schedule().rendering_radius(progress.fraction)
 
     def _frames_per_step(self) -> int:
         """Fewer than the settings' if there are many points."""

@@ -229,6 +229,18 @@ def _move(
 
 @no_type_check
 @triton.jit
+def _add_to_weights(total, bones, i: tl.constexpr, gradient, places, k, BONES: tl.constexpr):
+    """Add derivatives by skinning weights, given those by a coordinate of where the transforms put places."""
+    bone = tl.arange(0, BONES)
+    total += gradient[:, None] * tl.load(bones + 12 * bone + 4 * i + 3, mask=bone < k, other=0.0)[None, :]
+    for j in tl.static_range(3):
+        entry = tl.load(bones + 12 * bone + 4 * i + j, mask=bone < k, other=0.0)
+        total += (gradient * places[j])[:, None] * entry[None, :]
+    return total
+
+
+@no_type_check
+@triton.jit
 def _move_backward(
     by_posed, by_displacement, outputs, means, from_bones, to_bones, weights, by_outputs, by_means, outer, n, k, b,
     width, BONES: tl.constexpr, BLOCK: tl.constexpr,
@@ -259,15 +271,12 @@ def _move_backward(
             by_x, by_y, by_z = by_x - more_x, by_y - more_y, by_z - more_z
         given = given_x, given_y, given_z
         for i in tl.static_range(3):
-            last = tl.load(bones + 12 * bone + 4 * i + 3, mask=bone < k, other=0.0)
-            by_own += given[i][:, None] * last[None, :]
+            by_own = _add_to_weights(by_own, bones, i, given[i], shaped, k, BONES)
             tl.store(outer + 12 * at + 4 * i + 3, given[i], mask=there)
         for j in tl.static_range(3):
             by_shaped = x * 0.0
             for i in tl.static_range(3):
                 by_shaped += _blended(own, bones, 4 * i + j, k, BONES) * given[i]
-                entry = tl.load(bones + 12 * bone + 4 * i + j, mask=bone < k, other=0.0)
-                by_own += (given[i] * shaped[j])[:, None] * entry[None, :]
                 tl.store(outer + 12 * at + 4 * i + j, given[i] * shaped[j], mask=there)
             tl.store(by_outputs + wide * width + 3 + 3 * timestep + j, by_shaped * _UNIT, mask=there)
             if j == 0:
@@ -282,11 +291,7 @@ def _move_backward(
         right[0] * rest_x + right[1] * rest_y + right[2] * rest_z,
     )
     for i in tl.static_range(3):
-        last = tl.load(from_bones + 12 * bone + 4 * i + 3, mask=bone < k, other=0.0)
-        by_own -= through[i][:, None] * last[None, :]
-        for j in tl.static_range(3):
-            entry = tl.load(from_bones + 12 * bone + 4 * i + j, mask=bone < k, other=0.0)
-            by_own -= (through[i] * rest[j])[:, None] * entry[None, :]
+        by_own = _add_to_weights(by_own, from_bones, i, -through[i], rest, k, BONES)
     by_x, by_y, by_z = by_x + through[0], by_y + through[1], by_z + through[2]
     _store(by_means, 3 * wide, there, by_x, by_y, by_z)
     _store(by_outputs, wide * width, there, by_x * _UNIT, by_y * _UNIT, by_z * _UNIT)

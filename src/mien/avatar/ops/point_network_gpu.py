@@ -243,7 +243,7 @@ def _layer_inputs(inputs, values, n, source: tl.constexpr, VALUES_AT: tl.constex
     """Where the values with a number lie: those of the inputs, or of a layer."""
     if source == 0:
         return inputs
-    return values + n.to(tl.int64) * VALUES_AT[source - 1]
+    return values + tl.cast(n, tl.int64) * VALUES_AT[source - 1]
 
 
 @no_type_check
