@@ -35,7 +35,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         found.append(pose(*samples)[0].shape[-2])
         return pose
 
-    monkeypatch.setattr(graphs, "_on_gpu", lambda face: True)
+    monkeypatch.setattr(graphs, "is_on_gpu", lambda face: True)
     monkeypatch.setattr(torch.cuda, "make_graphed_callables", graph)
     monkeypatch.setenv(VARIABLE, "1")
     return found

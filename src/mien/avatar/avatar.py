@@ -114,6 +114,9 @@ class Extras:
     """Pixels by which finished pictures are eroded and then dilated (`close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
+    graph_key: Callable[[Progress], Hashable] | None = None
+    """Returns the numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`): the pose
+    has no side effects, as a factored gradient is one, and gives Gaussians alone."""
 
 
 class Avatar(nn.Module, ABC):
@@ -146,13 +149,6 @@ class Avatar(nn.Module, ABC):
 
         Differentiable in `face` and in the avatar's parameters.
         """
-
-    def graph_key(self, progress: Progress) -> Hashable:
-        """The numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`). Or None.
-
-        Such a pose has no side effects, as a factored gradient is one, and gives Gaussians alone.
-        """
-        return None
 
     @abstractmethod
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:

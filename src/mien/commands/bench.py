@@ -86,7 +86,7 @@ class TrainStep(_Timed):
 
     method: StepMethod = DEFAULT_METHOD
     """Method to measure. All but the default are measured at 512x512, with the sizes of their papers or of the preset
-    standard; point_avatar and textured_mesh on a GPU only."""
+    standard; some on a GPU only."""
     parts: bool = False
     """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
     A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the

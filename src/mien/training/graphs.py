@@ -1,7 +1,7 @@
 """CUDA graphs of a method's pose, between rounds of density: one launch forward and one backward in place of all.
 
 With `MIEN_GPU_GRAPHS=1`. A graph repeats launches on the same memory with the same numbers from the host. So it holds
-while all tensors of the avatar stay where they are and the method says that these numbers stay (`Avatar.graph_key`).
+while all tensors of the avatar stay where they are and the method says that these numbers stay (`Extras.graph_key`).
 Where there is no graph, the pose is the avatar's own: on a processor, for methods without a key, in the first step
 after a change, and for good once PyTorch could not make one. What reads from the GPU, as gsplat does, is never in it.
 """
@@ -35,7 +35,8 @@ class PoseGraph:
 
     def pose(self, avatar: Avatar, face: FaceParams, progress: Progress) -> Posed:
         """The same as `Avatar.pose`. The tensors of a result hold until the next one."""
-        own = avatar.graph_key(progress) if self._wanted and _on_gpu(face) else None
+        key_of = avatar.extras.graph_key
+        own = key_of(progress) if key_of is not None and self._wanted and is_on_gpu(face) else None
         if own is None:
             return avatar.pose(face, progress)
         moving = [getattr(face, name) for name in _MOVING]
@@ -44,14 +45,15 @@ class PoseGraph:
         if key != self._key:
             self._key, self._call = key, None
             return avatar.pose(face, progress)
-        if self._call is None:
+        call = self._call
+        if call is None:
             try:
-                self._call = _captured(avatar, face, progress, moving)
+                self._call = call = _captured(avatar, face, progress, moving)
             except RuntimeError as error:
                 self._wanted = False
                 tell(f"{VARIABLE}=1: PyTorch made no graph of the pose ({error}); training goes on without")
                 return avatar.pose(face, progress)
-        return Posed(_joined(self._call(*moving)), {})
+        return Posed(_joined(call(*moving)), {})
 
 
 class _Pose(nn.Module):
@@ -83,5 +85,6 @@ def _place(tensor: Tensor | None) -> Hashable:
     return None if tensor is None else (tensor.data_ptr(), tuple(tensor.shape))
 
 
-def _on_gpu(face: FaceParams) -> bool:
+def is_on_gpu(face: FaceParams) -> bool:
+    """Whether a face is where graphs are."""
     return face.expression.is_cuda

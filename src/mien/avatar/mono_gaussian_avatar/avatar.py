@@ -16,7 +16,6 @@ learns the face model's motion before the first picture (`pretraining`), and eac
 those that the network gives to its position (`own_rate`).
 """
 
-from collections.abc import Hashable
 from dataclasses import replace
 
 import torch
@@ -54,7 +53,7 @@ class MonoGaussianAvatar(FreePoints):
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
         pretraining = Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None
-        extras = Extras(frames_per_step=self._frames_per_step, pretraining=pretraining)
+        extras = Extras(frames_per_step=self._frames_per_step, pretraining=pretraining, graph_key=self._graph_key)
         super().__init__(config, face_model, face, extras)
         like = face_model.template
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
@@ -95,7 +94,7 @@ class MonoGaussianAvatar(FreePoints):
         sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
         return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
 
-    def graph_key(self, progress: Progress) -> Hashable:
+    def _graph_key(self, progress: Progress) -> float:
         """The radius of all points, which changes with the epoch."""
         return self._schedule().rendering_radius(progress.fraction)
 

@@ -167,7 +167,7 @@ class DeformationNet(nn.Module):
     def plan(self) -> list[PlannedLayer]:
         """The layers of `whole` for a GPU."""
         trunk = [PlannedLayer([Rows(_as_linear(layer))], "softplus") for layer in self.trunk]
-        last = [Rows(self.directions, self.hidden.out_features), Rows(self.skinning)]
+        last = [Rows(self.directions, _as_linear(self.hidden).out_features), Rows(self.skinning)]
         return [*trunk, PlannedLayer([Rows(_as_linear(self.hidden))], "softplus"), PlannedLayer(last, extra=len(trunk))]
 
     def whole(self, points: Float[Tensor, "n 3"]) -> Deformation:
@@ -214,7 +214,7 @@ class AttributeChangeNet(nn.Module):
         plan = [
             PlannedLayer([Rows(_as_linear(layer))], own) for layer, own in zip(self.trunk, activations, strict=True)
         ]
-        width = self.heads[0].out_features
+        width = _as_linear(self.heads[0]).out_features
         last = [Rows(_as_linear(output), index * width) for index, output in enumerate(self.outputs)]
         return [*plan, PlannedLayer([Rows(_as_linear(head)) for head in self.heads], "relu"), PlannedLayer(last)]
 
