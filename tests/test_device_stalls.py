@@ -131,7 +131,7 @@ def test_a_round_of_density_waits_once(method: str, monkeypatch: pytest.MonkeyPa
         )
     assert not launches.waits + constants.waits
     assert len(reads) == 1
-    assert len(state.avatar.store) == {1: 800, 3: 51}[reads[0]]
+    assert len(state.avatar.store) == {1: 400, 3: 51}[reads[0]]
 
 
 def without_features(config: MethodConfig) -> MethodConfig:

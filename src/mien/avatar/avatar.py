@@ -115,8 +115,8 @@ class Extras:
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
     graph_key: Callable[[Progress], Hashable] | None = None
-    """Returns the numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`): the pose
-    has no side effects, as a factored gradient is one, and gives Gaussians alone."""
+    """Returns the numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`): the
+    pose has no side effects, as a factored gradient is one, and gives Gaussians alone."""
 
 
 class Avatar(nn.Module, ABC):
