@@ -200,14 +200,12 @@ elsewhere: setup
 bench: setup
 	$(BIN)/mien bench render
 
-# On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked
-# gpu, then the figures for docs/results.md, into out/gpu.
+# On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked gpu, a step
+# of each method and `mien create` on a clip (VIDEO=FILE, or a synthetic head), in eight minutes. It prints a table.
+VIDEO ?=
 gpu: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --require-hashes --no-deps -r requirements/gsplat.txt
-	$(BIN)/pytest -m gpu
-	mkdir -p out/gpu
-	$(BIN)/mien bench render --device cuda --json > out/gpu/render.json
-	$(BIN)/mien bench train-step --device cuda --json > out/gpu/train_step.json
+	$(BIN)/python benchmarks/device.py --out out/gpu $(VIDEO:%=--video %)
 
 clean:
 	rm -rf build dist out .venv .venv312

@@ -17,9 +17,10 @@ from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
-from mien.lab.benchmarking import method_steps, scaling, step_parts, train_step
+from mien.lab.benchmarking import GPU_BENCHMARKS, method_steps, scaling, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, thread_counts, time_function
+from mien.plugins import named
 from mien.training.trainer import step
 from refusals import complaint
 
@@ -156,13 +157,16 @@ def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...])
 
 def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """The cases of a GPU run in float64 on the CPU, which executes all of their code but gsplat's."""
-    for room in (render_benchmark, train_step):
+    for room in (render_benchmark, train_step, method_steps):
         monkeypatch.setattr(room, "GPU_COUNTS", (60,))
-        monkeypatch.setattr(room, "PAPER_SIZES", {"": (24, 16)})
+        monkeypatch.setattr(room, *(("_SIZE", (24, 16)) if room is method_steps else ("PAPER_SIZES", {"": (24, 16)})))
     like = torch.zeros((), dtype=torch.float64)
     rows = [*render_benchmark.gpu_rows(like, 0.0), *train_step.gpu_rows(like, 0.0)]
     names = ["rasterize_forward", "rasterize_forward_backward", "train_step", "pose_and_render"]
     assert [row.name for row in rows] == names
+    for name in GPU_BENCHMARKS.keys() - {"gaussian_avatars"}:
+        rows += named(GPU_BENCHMARKS[name])(like, 0.0)
+    assert [row.name for row in rows[4:]] == ["train_step"] * 4
     assert all((row.gaussians, row.width, row.height) == (60, 24, 16) and row.min_ms > 0 for row in rows)
     if not torch.cuda.is_available():
         assert "--device cuda" in complaint(capsys, "bench", "render", "--device", "cuda")

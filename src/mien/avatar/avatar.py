@@ -5,7 +5,7 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -114,6 +114,9 @@ class Extras:
     """Pixels by which finished pictures are eroded and then dilated (`close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
+    graph_key: Callable[[Progress], Hashable] | None = None
+    """Returns the numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`): the
+    pose has no side effects, as a factored gradient is one, and gives Gaussians alone."""
 
 
 class Avatar(nn.Module, ABC):

@@ -174,7 +174,7 @@ def draw(
 ) -> tuple[Posed, list[Posed], list[Rendering]]:
     """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
     faces = [one.face for one in batch]
-    posed = state.avatar.pose(faces[0] if len(faces) == 1 else concatenate(faces), progress)
+    posed = state.graph.pose(state.avatar, faces[0] if len(faces) == 1 else concatenate(faces), progress)
     each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
     if state.head is not None:
         each = [state.head.posed(own, one) for one, own in zip(batch, each, strict=True)]

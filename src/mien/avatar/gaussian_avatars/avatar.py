@@ -214,6 +214,9 @@ def resting_opacities(store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[
 def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
     """Allow no prunes on a triangle that would otherwise lose all its Gaussians (section 3.3)."""
     face_index = store["face_index"]
-    kept = torch.zeros(int(face_index.max()) + 1, dtype=torch.bool, device=prune.device)
-    kept[face_index[~prune]] = True
-    return prune & kept[face_index]
+    # Triangles get the numbers of their order, which are below that of Gaussians: nothing is read from a GPU.
+    ordered, order = face_index.sort()
+    numbers = (ordered != ordered.roll(1)).cumsum(0).sub_(1).clamp_min_(0)
+    own = torch.empty_like(order).scatter_(0, order, numbers)
+    kept = torch.zeros_like(own).index_add_(0, own, (~prune).to(own.dtype))
+    return prune & (kept[own] > 0)
