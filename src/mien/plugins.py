@@ -22,6 +22,7 @@ _EXTRAS = {
     "video": "av",
     "create": "torch filelock cv2 mediapipe ai_edge_litert anny stlpips_pytorch matplotlib PIL jinja2 scipy zstandard",
     "viewer": "viser",
+    "studio": "starlette uvicorn segno",
     "usd": "pxr",
     "cuda": "gsplat",
     "batch": "submitit ray fsspec s3fs",

@@ -11,7 +11,7 @@ from mien.capture.settings import CaptureSettings
 from mien.commands.train_options import Elsewhere, TrainOptions
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.pipeline.names import check_sources, check_viewer, run_name, sequence_names
+from mien.pipeline.names import check_growing, check_sources, check_viewer, run_name, sequence_names
 from mien.tracking.settings import (
     PaperSettings,
     PhotometricSettings,
@@ -73,6 +73,8 @@ class Command:
     """Frames in overlay.mp4: all, every n-th, at most 120 (auto), or none."""
     view: bool = False
     """Show the avatar in a browser while it trains."""
+    growing: Path | None = None
+    """A .mien file to write the avatar to from time to time while it trains. `mien view FILE --follow` shows it."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions.of)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: _Tracking = field(default_factory=_Tracking)
@@ -84,6 +86,8 @@ class Command:
         self.options.check()
         if self.view:
             check_viewer()
+        if self.growing is not None:
+            check_growing(self.growing)
         if needs := SPLITS[split := self.options.settings().split].needs:
             raise UserError(
                 f"--split {split}: needs {needs}, and this command makes one sequence; use `mien capture` for each or "
@@ -137,7 +141,7 @@ class Command:
             show_trackings(workspace, list(trackings), self.overlay)
             begin("training")
             published = PRESETS[self.options.preset].published
-            run_training_stage(workspace, names, run, method, settings, self.view, published)
+            run_training_stage(workspace, names, run, method, settings, self.view, published, self.growing)
             show_page(workspace, run)
             if settings.holds_out:
                 begin("scoring")

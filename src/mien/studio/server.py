@@ -1,0 +1,135 @@
+"""The studio's server: uvicorn on a socket of loopback, and with `lan` on another one for phones."""
+
+import contextlib
+import logging
+import socket
+import threading
+from http import HTTPStatus
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import uvicorn
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mien.disk.locks import hold
+from mien.errors import UserError
+from mien.studio.app import Studio
+from mien.studio.making import Maker
+from mien.studio.people import People
+from mien.studio.phone import Phones, address_on_network
+from mien.viewer.access import HEADERS, LOOPBACK_NAMES, Door, address_of, listen
+
+_HEADERS = {
+    **HEADERS, "X-Frame-Options": "SAMEORIGIN", "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}  # fmt: skip
+_STRANGE = b"This address is not that of the studio. Open the whole address that mien printed.\n"
+_MOST_CONNECTIONS = 64
+
+
+class Guard:
+    """Asks the door about each request of this machine's browsers, and the host about each of phones."""
+
+    def __init__(self, door: Door, port: int, app: ASGIApp, phones: Phones | None) -> None:
+        """Guard the answers of `app` at a port of loopback, and those of `phones` at every other one."""
+        self._door, self._port, self._app = door, port, app
+        self._for_phones = None if phones is None else phones.app()
+        self._host_of_phones = "" if phones is None else urlsplit(phones.address).netloc
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = {name.lower() for name, _ in message["headers"]}
+                added = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
+                message["headers"] = [*message["headers"], *(pair for pair in added if pair[0] not in given)]
+            await send(message)
+
+        if scope["type"] != "http":
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        host, origin = headers.get("host", ""), headers.get("origin")
+        if scope["server"][1] != self._port:
+            known = self._for_phones is not None and host == self._host_of_phones
+            if not known or origin not in (None, f"http://{host}") or self._for_phones is None:
+                await _refuse(guarded, HTTPStatus.FORBIDDEN, _STRANGE)
+                return
+            await self._for_phones(scope, receive, guarded)
+            return
+        if host not in {f"{f'[{name}]' if ':' in name else name}:{self._port}" for name in LOOPBACK_NAMES}:
+            await _refuse(guarded, HTTPStatus.FORBIDDEN, _STRANGE)
+            return
+        path = scope["path"] + "?" + scope["query_string"].decode("latin-1")
+        told = self._door.answer(path, headers)
+        if told is not None:
+            await _refuse(guarded, told.status, told.body, **told.headers)
+            return
+        await self._app(scope, receive, guarded)
+
+
+async def _refuse(send: Send, status: HTTPStatus, body: bytes, **headers: str) -> None:
+    given = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), **headers}
+    start = [(name.lower().encode(), value.encode()) for name, value in given.items()]
+    await send({"type": "http.response.start", "status": status.value, "headers": start})
+    await send({"type": "http.response.body", "body": body})
+
+
+class Serving:
+    """A studio that runs."""
+
+    def __init__(self, root: Path, port: int = 0, lan: bool = False, maker: Maker | None = None) -> None:
+        """Start the server of a folder, and go on with its queue. `maker` replaces it, for trials."""
+        with contextlib.ExitStack() as closing:
+            people = People(root)
+            closing.enter_context(hold(root / ".studio" / "server", remedy="use that studio, or end it first"))
+            self.door = Door.of("127.0.0.1")
+            own = closing.enter_context(contextlib.closing(listen(self.door.host, port)))
+            self.port, sockets = int(own.getsockname()[1]), [own]
+            self.address = address_of(self.door, own)
+            phones = None
+            if lan:
+                sockets.append(closing.enter_context(contextlib.closing(_listen_on_network())))
+                host, at = sockets[1].getsockname()[:2]
+                phones = Phones(people, f"http://{host}:{at}")
+            self.phones, self.maker = phones, maker or Maker(people)
+            guard = Guard(self.door, self.port, Studio(people, self.maker, phones).app, phones)
+            logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # a client that vanishes is no error
+            self._server = uvicorn.Server(
+                uvicorn.Config(
+                    guard,
+                    log_config=None,
+                    access_log=False,
+                    lifespan="off",
+                    ws="none",
+                    http="h11",
+                    loop="asyncio",
+                    server_header=False,
+                    proxy_headers=False,
+                    limit_concurrency=_MOST_CONNECTIONS,
+                    timeout_graceful_shutdown=2,
+                )  # fmt: skip
+            )
+            self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": sockets}, daemon=True)
+            self._thread.start()
+            self.maker.start()
+            self._closing = closing.pop_all()
+
+    def wait(self) -> None:
+        """Wait until the server ends, which is a bug. Ctrl-C and SIGTERM end the wait, too."""
+        while self._thread.is_alive():
+            self._thread.join(0.5)
+
+    def stop(self) -> None:
+        """Stop what is made, which the next studio goes on with, and close all connections."""
+        self._server.should_exit = True
+        self.maker.end()
+        self._thread.join(10.0)
+        self._closing.close()
+
+
+def _listen_on_network() -> socket.socket:
+    host = address_on_network()
+    if host is None:
+        raise UserError("--lan: this machine is on no network; connect it, or leave --lan out")
+    return listen(host, 0)
