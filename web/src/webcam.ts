@@ -14,6 +14,15 @@ export type { Smoothing } from "./one_euro";
 
 export type WebcamState = "off" | "opening" | "calibrating" | "running" | "no face";
 
+/** What a page says in each state. */
+export const WORDS: Record<WebcamState, string> = {
+  off: "",
+  opening: "Opening the camera. Allow it if the browser asks.",
+  calibrating: "Look straight ahead with a relaxed face for a second.",
+  running: "The avatar follows your face.",
+  "no face": "No face is seen. Look into the camera, in good light.",
+};
+
 /** Milliseconds without a face after which the state says so. */
 const LOST_AFTER = 1000;
 

@@ -160,7 +160,9 @@ class Studio:
         content = await json_of(request)
         if content.get("agreed") is not True:
             raise UserError("the person has to agree before the first recording; ask, and confirm it")
-        name = str(content.get("name", "")).strip()
+        name = content.get("name")
+        if not isinstance(name, str):
+            raise UserError("the request has no name; give one")
         await run_in_threadpool(self.people.add, name)
         return JSONResponse({"name": name}, HTTPStatus.CREATED)
 

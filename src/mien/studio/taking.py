@@ -35,7 +35,7 @@ TAKINGS = {
         "The same, and the face in front of a camera drives it. Nothing leaves it.",
         ("--webcam",),
     ),
-    "film": Taking("Film", "me.mp4", "Plays everywhere: five seconds of the avatar.", None),
+    "film": Taking("Video", "me.mp4", "Plays everywhere: five seconds of the avatar.", None),
     "glb": Taking("GLB", "me.glb", "Opens in Blender, Unity, Unreal and Godot, with its expressions."),
     "mien": Taking("MIEN", "me.mien", "Opens with mien, in Python and in pages of your own. All of the avatar."),
     "splats": Taking("Splats", "me.ply", "Opens in SuperSplat and other viewers of Gaussian splats. One pose."),

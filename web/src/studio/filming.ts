@@ -11,11 +11,11 @@ const FORMATS = [["video/webm;codecs=h264", "webm"], ["video/webm;codecs=vp8", "
 /** Bits of a second of the recording: fine detail is what avatars are made of. */
 const BITS = 16_000_000;
 const FACE = 256;
+/** Longest side in pixels of what the detector sees. */
+const SEEN = 720;
 
-export const detector = new Detector(
-  () => ({ vision: "/landmarker/vision", loader: "/landmarker/loader", wasm: "/landmarker/wasm", model: "/landmarker/model" }),
-  2,
-);
+export const PARTS = { vision: "/landmarker/vision", loader: "/landmarker/loader", wasm: "/landmarker/wasm", model: "/landmarker/model" };
+const detector = new Detector(() => PARTS, 2);
 
 /** A picture of a face for the list, as JPEG. */
 export async function portrait(video: HTMLVideoElement, [x0, y0, x1, y1]: number[]): Promise<Blob> {
@@ -35,7 +35,8 @@ export class Filming {
 
   private stream: MediaStream | null = null;
   private recorder: MediaRecorder | null = null;
-  private film = "";
+  /** The name of the film that is recorded. */
+  film = "";
   private sending: Sending | null = null;
   private running = false;
   private box: number[] | null = null;
@@ -62,7 +63,7 @@ export class Filming {
     detector.onError = (why) => this.fail(why);
     const watch = (now: number) => {
       if (!this.running) return;
-      detector.see(() => createImageBitmap(this.video), now);
+      look(this.video, now);
       requestAnimationFrame(watch);
     };
     requestAnimationFrame(watch);
@@ -109,6 +110,12 @@ export class Filming {
   }
 }
 
+/** Lets the detector see the picture of this moment, which needs no more pixels than that. */
+function look(video: HTMLVideoElement, now: number): void {
+  const { videoWidth: w, videoHeight: h } = video, scale = Math.min(1, SEEN / Math.max(w, h));
+  void detector.see(() => createImageBitmap(video, { resizeWidth: Math.round(w * scale), resizeHeight: Math.round(h * scale) }), now);
+}
+
 /** How many pictures of a film are looked at in a second of it. */
 const LOOKS = 3;
 
@@ -131,7 +138,7 @@ export async function check(source: string, moved: (share: number) => void): Pro
     const found = await new Promise<Parameters<typeof detector.onFound>[0]>((done, fail) => {
       detector.onFound = done;
       detector.onError = (why) => fail(new Error(why));
-      detector.see(() => createImageBitmap(video), performance.now());
+      look(video, performance.now());
     });
     guide.see({ ...found, milliseconds: 1000 * time }, found.box ? lightOf(video, found.box) : null);
     if (!face && found.box && time >= 1) face = await portrait(video, found.box);

@@ -32,10 +32,10 @@ export function addRings(place: SVGElement | HTMLElement): (guide: Guide) => voi
       return path;
     });
   place.replaceChildren(outline, dot);
-  const turned = pieces(TURNS, DIRECTIONS, -Math.PI / DIRECTIONS), moved = pieces(MOVES, MOTIONS.length, Math.PI / 2 - Math.PI / MOTIONS.length);
+  const turned = pieces(TURNS, DIRECTIONS, -Math.PI / DIRECTIONS), moved = pieces(MOVES, MOTIONS.length, Math.PI / 2);
   MOTIONS.forEach(({ name }, k) => {
-    const angle = Math.PI / 2 + (2 * Math.PI * k) / MOTIONS.length;
-    const text = element("text", { x: (1.17 * MOVES[0] + 4) * Math.cos(angle), y: -(MOVES[1] + 6) * Math.sin(angle), "font-size": 7 });
+    const angle = Math.PI / 2 + (2 * Math.PI * (k + 0.5)) / MOTIONS.length;
+    const text = element("text", { x: (MOVES[0] + 11) * Math.cos(angle), y: -(MOVES[1] + 6) * Math.sin(angle) });
     text.textContent = name;
     place.append(text);
   });

@@ -3,8 +3,9 @@
 import { addTurning, fit } from "../controls";
 import { readMien } from "../format";
 import { Viewer } from "../viewer";
+import { Webcam, WORDS } from "../webcam";
 import { ask, endingOf, person, Sending, type Film, type Listed, type Progress, type Settings, type Short, type Whole } from "./api";
-import { check, Filming } from "./filming";
+import { check, Filming, PARTS } from "./filming";
 import { attempt, busy, button, duration, fill, find, make, on, press, say } from "./page";
 import { addRings } from "./rings";
 
@@ -19,9 +20,13 @@ let whole: Whole | null = null;
 let filming: Filming | null = null;
 let fillRings: ReturnType<typeof addRings>;
 let viewer: Viewer | null = null;
-let grown = 0;
-/** What the stage shows, if a person has chosen that: a film, or the page that a face drives. */
-let chosen: { film?: string; driven?: boolean } = {};
+/** Address of the avatar on the stage's canvas. */
+let shown = "";
+/** The film that the stage shows; empty if none was chosen. */
+let chosen = "";
+/** The camera that drives the avatar. */
+const webcam = new Webcam(() => PARTS);
+let detach = () => {};
 /** What would make each film better, by its name. */
 const checked = new Map<string, string[]>();
 const video = () => find<HTMLVideoElement>("camera");
@@ -45,7 +50,7 @@ function showList(): void {
   fill("people", listed.people, () =>
     listed.people.map((each) => {
       const card = press("", () => go(each.name), `${each.name}: ${words(each.progress)}`);
-      card.append(faceOf(each), make("strong", {}, each.name), make("small", {}, `${words(each.progress)} · ${dateOf(each.changed)}`));
+      card.append(faceOf(each), make("strong", {}, each.name), make("small", {}, words(each.progress)), make("small", {}, dateOf(each.changed)));
       return make("li", {}, card);
     }),
   );
@@ -61,7 +66,7 @@ function filmRow(name: string, film: Film, number: number): HTMLElement {
   const text = make("span", {}, `Film ${number}`, make("small", {}, about), ...(note ? [make("small", {}, note)] : []));
   const remove = press("Remove", () => removeFilm(name, film, number), `Remove film ${number}`);
   if (!film.whole) return make("li", {}, text, press("Keep", () => keep(name, film.name), `Keep film ${number}`), remove);
-  const play = press("Play", () => ((chosen = { film: film.name }), showStage()), `Play film ${number}`);
+  const play = press("Play", () => ((chosen = film.name), showStage()), `Play film ${number}`);
   const again = press("Check", () => checkFilm(name, film.name, person(name, "films", film.name)), `Check film ${number}`);
   return make("li", {}, text, play, ...(better ? [] : [again]), remove);
 }
@@ -74,7 +79,7 @@ async function keep(name: string, film: string): Promise<void> {
 async function removeFilm(name: string, film: Film, number: number): Promise<void> {
   if (!(await sure(`Delete film ${number}?`, "The film is removed from this machine. An avatar that was made of it stays."))) return;
   await ask("DELETE", person(name, "films", film.name));
-  chosen = {};
+  chosen = "";
   await look();
 }
 
@@ -112,8 +117,9 @@ async function send(file: File): Promise<void> {
 /** Opens the camera on the stage. */
 async function film(): Promise<void> {
   if (filming || !whole) return;
+  webcam.stop();
   const own = (filming = new Filming(whole.name, video()));
-  chosen = {};
+  chosen = "";
   fillRings(own.guide);
   showStage();
   find("request").textContent = "Opening the camera. Allow it if the browser asks.";
@@ -170,20 +176,22 @@ function closeCamera(): void {
 function showStage(): void {
   if (!whole) return;
   const { name, progress, made } = whole, making = progress.state === "making";
-  const living = made && !making ? `${person(name, "take", chosen.driven ? "webcam" : "page")}` : "";
-  const shows = filming ? "camera" : chosen.film ? "review" : living ? "living" : making && whole.growing ? "grown" : making && whole.fit && progress.stage?.name === "tracking" ? "fit" : whole.face ? "poster" : "empty";
+  const driven = webcam.state !== "off", living = made && !making ? person(name, "take", "page") : "";
+  const shows = filming ? "camera" : driven ? "grown" : chosen ? "review" : living ? "living" : making && whole.growing ? "grown" : making && whole.fit && progress.stage?.name === "tracking" ? "fit" : whole.face ? "poster" : "empty";
   for (const id of ["review", "living", "grown", "fit", "poster", "empty"]) find(id).hidden = id !== shows;
-  for (const id of ["camera", "rings", "words", "bar"]) (find(id) as HTMLElement).toggleAttribute("hidden", shows !== "camera");
+  for (const id of ["camera", "rings", "bar"]) find(id).toggleAttribute("hidden", shows !== "camera");
+  find("words").hidden = !filming && !driven;
   const recording = filming?.recording ?? false;
   button("record").hidden = recording;
   button("finish").hidden = !recording;
   button("cancel").textContent = recording ? "Throw away" : "Close the camera";
   if (!filming) find("fault").hidden = true;
-  show<HTMLVideoElement>("review", shows === "review" ? person(name, "films", chosen.film!) : "");
+  show<HTMLVideoElement>("review", shows === "review" ? person(name, "films", chosen) : "");
   show<HTMLIFrameElement>("living", shows === "living" ? `${living}?${whole.changed}` : "");
   show<HTMLIFrameElement>("fit", shows === "fit" ? `${person(name, "fit")}?${whole.fit}` : "");
   show<HTMLImageElement>("poster", shows === "poster" ? `${person(name, "face")}?${whole.face}` : "");
-  if (shows === "grown") void attempt(grow);
+  find("poster").classList.toggle("developing", making);
+  if (shows === "grown" && !driven) void attempt(() => showAvatar(`${person(name, "growing")}?${whole!.growing}`));
 }
 
 /** Sets what a frame, a picture or a film shows, unless it shows that already. */
@@ -194,11 +202,11 @@ function show<T extends HTMLElement & { src: string }>(id: string, source: strin
   else place.removeAttribute("src");
 }
 
-/** Takes the newest state of the avatar that trains, in the view that was chosen for the last one. */
-async function grow(): Promise<void> {
-  if (!whole?.growing || whole.growing === grown) return;
-  grown = whole.growing;
-  const answer = await fetch(`${person(whole.name, "growing")}?${grown}`);
+/** Shows an avatar on the stage's canvas, in the view that was chosen for the last one. */
+async function showAvatar(address: string): Promise<void> {
+  if (address === shown) return;
+  shown = address;
+  const answer = await fetch(address);
   if (!answer.ok) return;
   const canvas = find<HTMLCanvasElement>("grown"), { yaw, pitch, zoom } = viewer ?? { yaw: 0, pitch: 0, zoom: 1 };
   const next = readMien(await answer.arrayBuffer());
@@ -210,6 +218,19 @@ async function grow(): Promise<void> {
   addTurning(viewer, fresh);
   fit(viewer);
   viewer.look();
+}
+
+/** Lets the avatar follow the face in front of the camera, or ends that. */
+async function beMe(): Promise<void> {
+  if (webcam.state !== "off") return webcam.stop();
+  const { name, takings } = whole!;
+  if (!takings.find(({ kind }) => kind === "mien")?.ready) await ask("POST", person(name, "take", "mien"), {});
+  chosen = "";
+  const starting = webcam.start();
+  showStage();
+  await Promise.all([starting, showAvatar(person(name, "take", "mien"))]);
+  detach();
+  detach = webcam.attach(viewer!);
 }
 
 function showMaking(): void {
@@ -231,11 +252,10 @@ function showMaking(): void {
   stopped.className = state === "failed" ? "bad" : "soft";
   stopped.textContent = state === "failed" ? `It failed: ${progress.error}` : `${words(progress)}. It goes on from there.`;
   const start = button("make");
-  start.hidden = going;
+  find("making").hidden = going;
   start.textContent = state === "stopped" ? "Go on" : state === "failed" ? "Try again" : whole!.made ? "Make it again" : "Make the avatar";
   start.disabled = !films.some((each) => each.whole);
-  button("stop").hidden = !going;
-  find("more").hidden = going;
+  start.classList.toggle("main", !whole!.made || state === "stopped" || state === "failed");
   fill("quality", listed.offered.qualities, () => listed.offered.qualities.map((value) => make("option", { value }, QUALITIES[value] ?? value)));
   fill("method", listed.offered.methods, () => listed.offered.methods.map((value) => make("option", { value }, value.replaceAll("_", " "))));
   if (find("more").dataset.of === whole!.name) return;
@@ -273,8 +293,6 @@ function showTakings(): void {
       return make("li", {}, make("span", {}, title, make("small", {}, opens)), save);
     }),
   );
-  button("be-me").hidden = Boolean(chosen.driven);
-  button("look").hidden = !chosen.driven && !chosen.film;
   find("better").hidden = !advice.length;
   fill("advice", advice, () => advice.map((each) => make("li", {}, make("span", {}, each))));
 }
@@ -282,7 +300,9 @@ function showTakings(): void {
 function showPerson(): void {
   const { name, films } = whole!;
   if (find("title").textContent !== name) find("title").textContent = name;
-  fill("films", [films, [...checked]], () => films.map((each, k) => filmRow(name, each, k + 1)));
+  const rows = films.map((each, k) => ({ each, number: k + 1 })).filter(({ each }) => each.name !== filming?.film);
+  fill("films", [rows, [...checked]], () => rows.map(({ each, number }) => filmRow(name, each, number)));
+  for (const id of ["film", "choose", "from-phone"]) button(id).disabled = filming !== null;
   button("film").textContent = films.length ? "Film more" : "Film";
   button("film").classList.toggle("main", !films.length);
   showMaking();
@@ -393,7 +413,8 @@ function connect(): void {
   on("no-phone", "click", () => find<HTMLDialogElement>("phone").close());
   on("phone", "close", () => whole && !whole.phone?.film && ask("DELETE", person(whole.name, "phone")));
   start("make", async () => {
-    chosen = {};
+    webcam.stop();
+    chosen = "";
     await ask("POST", person(whole!.name, "making"), settings());
     await look();
   });
@@ -401,21 +422,21 @@ function connect(): void {
     await ask("DELETE", person(whole!.name, "making"));
     await look();
   });
-  start("be-me", async () => {
-    if (!whole!.takings.find(({ kind }) => kind === "webcam")?.ready) await ask("POST", person(whole!.name, "take", "webcam"), {});
-    chosen = { driven: true };
-    await look();
-  });
-  start("look", () => {
-    chosen = {};
-    return look();
-  });
+  start("be-me", beMe);
+  start("neutral", () => webcam.calibrate());
+  webcam.onState = (state, why) => {
+    if (why) say(why);
+    button("be-me").textContent = state === "off" ? "Be me" : "Stop";
+    button("neutral").hidden = state === "off";
+    find("request").textContent = WORDS[state];
+    showStage();
+  };
   start("delete", remove);
   addEventListener("hashchange", () => {
     closeCamera();
-    chosen = {};
+    webcam.stop();
+    chosen = shown = "";
     checked.clear();
-    grown = 0;
     viewer?.dispose();
     viewer = null;
     void look();
