@@ -439,7 +439,8 @@ function connect(): void {
     checked.clear();
     viewer?.dispose();
     viewer = null;
-    void look();
+    // Who reads by ear or walks by keys begins at the top of what is new.
+    void look().then(() => find("title").focus());
   });
   const stage = find("person");
   stage.addEventListener("dragover", (event) => (event.preventDefault(), stage.classList.add("over")));
