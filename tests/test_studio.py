@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,8 @@ def test_strangers_are_refused_and_the_server_lives(serving: Serving) -> None:
             {"Host": f"127.0.0.1.evil.example:{serving.port}"}, {"Origin": "http://evil.example"}, {"Origin": "null"},
             {"Origin": f"https://{own}"[:-1]}, {"Host": f"localhost:{serving.port}"},
         ):  # fmt: skip
-            assert asked(serving, method, path, {} if method == "POST" else None, **headers)[0] == 403, headers
+            given: Any = {} if method == "POST" else None
+            assert asked(serving, method, path, given, port=0, **headers)[0] == 403, headers
     assert asked(serving, "GET", "/?token=wrong", Cookie="")[0] == 403
     status, headers, _ = asked(serving, "GET", f"/?token={serving.door.token}", Cookie="", Origin="")
     assert (status, "HttpOnly" in headers["set-cookie"]) == (303, True)
@@ -200,7 +202,7 @@ def test_a_killed_studio_takes_its_work_along_and_the_next_one_goes_on(tmp_path:
         until(state.is_file)
         until(lambda: "process" in state.read_text())
         worker = int(re.findall(r"process (\d+)", state.read_text())[0])
-        refuses("another process", Serving, tmp_path)
+        refuses("is being written by another command", Serving, tmp_path)
     finally:
         first.kill()
         first.wait()
@@ -272,7 +274,7 @@ def test_takings_are_written_by_export_and_old_ones_are_not_given(serving: Servi
     }
     status, answer = told(serving, "POST", f"{taking}/mien", {})
     assert status == 400
-    assert "config.json" in answer["error"], "the words of `mien export`"
+    assert "holds no trained avatar" in answer["error"], "the words of `mien export`"
     (folder / "me.html").write_text("<p>alive</p>")
     status, headers, page = asked(serving, "GET", f"{taking}/page?save")
     assert (status, page) == (200, b"<p>alive</p>")

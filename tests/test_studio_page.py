@@ -112,14 +112,14 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
         first = [
             {"click": "New person"}, {"fill": ["Who is it?", "Ada"]}, {"click": "This person has agreed"},
             {"click": "Continue"}, {"see": "Half a minute of film is enough."}, {"press": "#film"},
-            {"see": "Put your face into the outline, then record."}, {"press": "#record"}, {"see": "· 2 s"},
+            {"see": "Put your face into the outline, then record."}, {"press": "#record"}, {"see": "0:02"},
         ]  # fmt: skip
         closed = browse(serving.address, steps=first, **asked)
         (unfinished,) = told(serving, "GET", person("Ada"))[1]["films"]
         assert (unfinished["whole"], unfinished["size"] > 10_000) == (False, True), "the tab was closed"
         second = [
             {"see": "Ada"}, {"press": "#people button"}, {"click": "Keep"}, {"see": "512×512"}, {"press": "#film"},
-            {"see": "Put your face"}, {"press": "#record"}, {"see": "· 2 s"}, {"press": "#finish"}, {"see": "Film 2"},
+            {"see": "Put your face"}, {"press": "#record"}, {"see": "0:02"}, {"press": "#finish"}, {"see": "Film 2"},
             {"press": "#make"}, {"see": "Stop"},
         ]  # fmt: skip
         made = browse(serving.address, steps=second, **asked)

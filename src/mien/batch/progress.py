@@ -79,12 +79,12 @@ class Stage:
     """How far its present part is; None if that is not known."""
 
 
-def stage_of(log: Path) -> Stage:
-    """The stage that the command which writes a log is in."""
+def stage_of(log: Path, since: int = 0) -> Stage:
+    """The stage that the command which writes a log is in, by what follows its first `since` bytes."""
     found, percent, text = ("", 0, 0), None, ""
     for most in (1 << 13, 1 << 17, 1 << 22):  # hours of lines may follow that of a stage
         if not _STAGE.search(text):
-            text = tail(log, most=most)
+            text = tail(log, since, most)
     for line in text.replace("\r", "\n").splitlines():
         if named := _STAGE.search(line):
             now = (named[3], int(named[1]), int(named[2]))

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from functools import cache
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -18,7 +18,6 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from mien.avatar.methods import method_names
-from mien.disk.config import decode
 from mien.disk.reading import check_unlinked, parse_json
 from mien.errors import CannotWriteError, UserError
 from mien.formats.shared.webcam import webcam_files
@@ -27,8 +26,10 @@ from mien.machine.threads import thread_count
 from mien.studio.advice import advice_for
 from mien.studio.making import QUALITIES, Maker, Settings
 from mien.studio.people import MOST_CHUNK, FullError, NotThereError, OtherPlaceError, People
-from mien.studio.phone import Phones
 from mien.studio.taking import TAKINGS, place_of, take
+
+if TYPE_CHECKING:
+    import mien.studio.phone
 
 _MOST_JSON = 16 << 10
 _PAGES = Path(__file__).parent
@@ -110,209 +111,171 @@ async def append(request: Request, people: People, name: str, film: str) -> Resp
     return JSONResponse({"size": await run_in_threadpool(people.append, name, film, int(place), piece)})
 
 
+def does(act: Callable[..., Any], status: HTTPStatus = HTTPStatus.OK) -> Answering:
+    """An answer that calls a function with what the path names, in a thread, and sends what it returns as json.
+
+    A POST has to bring json, which no form of another page can send.
+    """
+
+    async def doing(request: Request) -> Response:
+        if request.method == "POST":
+            await json_of(request)
+        return JSONResponse(await run_in_threadpool(act, **request.path_params) or {}, status)
+
+    return doing
+
+
+def sends(place: Callable[..., Path]) -> Answering:
+    """An answer that sends the file which a function names, or the part of it that the browser asks for."""
+
+    async def sending(request: Request) -> Response:
+        path = await run_in_threadpool(place, **request.path_params)
+        check_unlinked(path)
+        if not path.is_file():
+            raise NotThereError(f"{path.name}: is not there yet")
+        saved = f"{request.path_params['name']} {path.name}" if "save" in request.query_params else None
+        return FileResponse(path, filename=saved, headers={"Content-Security-Policy": _FRAMED})
+
+    return sending
+
+
 class Studio:
     """The answers to a browser on this machine. The door has let it in."""
 
-    def __init__(self, people: People, maker: Maker, phones: Phones | None) -> None:
+    def __init__(self, people: People, maker: Maker, phones: "mien.studio.phone.Phones | None") -> None:
         """Prepare the answers. Without `phones`, none can send a film."""
         self.people, self.maker, self.phones = people, maker, phones
         person, film = "/api/people/{name}", "/api/people/{name}/films/{film}"
+        taken = "/api/people/{name}/take/{kind}"
         routes: list[tuple[str, str, Answering]] = [
-            ("GET", "/", self.home), ("GET", "/index.html", self.home), ("GET", "/landmarker/{part}", self.landmarker),
-            ("GET", "/api/people", self.list), ("POST", "/api/people", self.add),
-            ("GET", person, self.show), ("DELETE", person, self.remove),
-            ("GET", f"{person}/face", self.face), ("PUT", f"{person}/face", self.set_face),
-            ("POST", f"{person}/films", self.begin_film), ("PUT", film, self.append),
-            ("POST", film, self.finish_film), ("DELETE", film, self.remove_film), ("GET", film, self.film),
-            ("POST", f"{person}/making", self.make), ("DELETE", f"{person}/making", self.stop),
-            ("GET", f"{person}/growing", self.growing), ("GET", f"{person}/fit", self.fit),
-            ("POST", f"{person}/take/{{kind}}", self.prepare), ("GET", f"{person}/take/{{kind}}", self.take),
-            ("POST", f"{person}/phone", self.open_phone), ("DELETE", f"{person}/phone", self.close_phone),
+            ("GET", "/", self._home), ("GET", "/index.html", self._home), ("GET", "/landmarker/{part}", _landmarker),
+            ("GET", "/api/people", does(self._list)), ("POST", "/api/people", self._add),
+            ("GET", person, does(self._whole)), ("DELETE", person, does(self._remove)),
+            ("GET", f"{person}/face", sends(lambda name: people.folder(name) / "face.jpg")),
+            ("PUT", f"{person}/face", self._set_face), ("POST", f"{person}/films", self._begin_film),
+            ("PUT", film, self._append), ("POST", film, does(people.finish_film)),
+            ("DELETE", film, does(people.remove_film)), ("GET", film, sends(people.film)),
+            ("POST", f"{person}/making", self._make), ("DELETE", f"{person}/making", does(maker.drop)),
+            ("GET", f"{person}/growing", sends(maker.growing)),
+            ("GET", f"{person}/fit", sends(lambda name: people.folder(name) / "tracking_preview.html")),
+            ("POST", taken, does(self._prepare)), ("GET", taken, sends(self._taken)),
+            ("POST", f"{person}/phone", does(self._invite)), ("DELETE", f"{person}/phone", does(self._uninvite)),
         ]  # fmt: skip
         found = [Route(path, answered(answer), methods=[method]) for method, path, answer in routes]
         self.app = Starlette(routes=found, exception_handlers={Exception: _failed})
+        self.app.router.redirect_slashes = False
 
-    async def home(self, request: Request) -> Response:
-        """The page."""
+    async def _home(self, request: Request) -> Response:
         return page_response("studio.html")
 
-    async def landmarker(self, request: Request) -> Response:
-        """A part of the face landmarker that the page runs."""
-        part = request.path_params["part"]
-        parts = await run_in_threadpool(_landmarker)
-        if part not in parts:
-            raise NotThereError(f"{part:.40}: is no part of the landmarker")
-        return Response(parts[part], media_type="application/octet-stream")
-
-    async def list(self, request: Request) -> Response:
+    def _list(self) -> dict[str, Any]:
         """All people, and what the page offers."""
-        people = await run_in_threadpool(lambda: [self._short(name) for name in self.people.names()])
-        offered = {
-            "qualities": QUALITIES,
-            "methods": method_names(),
-            "threads": thread_count(),
-            "lan": bool(self.phones),
-        }
-        return JSONResponse({"folder": self.people.root.resolve().name, "people": people, "offered": offered})
+        offered = {"qualities": QUALITIES, "methods": method_names(), "threads": thread_count()}
+        offered |= {"lan": self.phones is not None}
+        people = [self._short(name) for name in self.people.names()]
+        return {"folder": self.people.root.resolve().name, "people": people, "offered": offered}
 
-    async def add(self, request: Request) -> Response:
+    async def _add(self, request: Request) -> Response:
         """Add a person, who must have agreed."""
         content = await json_of(request)
+        name = content.get("name")
         if content.get("agreed") is not True:
             raise UserError("the person has to agree before the first recording; ask, and confirm it")
-        name = content.get("name")
         if not isinstance(name, str):
             raise UserError("the request has no name; give one")
-        await run_in_threadpool(self.people.add, name)
-        return JSONResponse({"name": name}, HTTPStatus.CREATED)
+        await run_in_threadpool(self.people.add, name.strip())
+        return JSONResponse({"name": name.strip()}, HTTPStatus.CREATED)
 
-    async def show(self, request: Request) -> Response:
-        """Everything about a person."""
-        return JSONResponse(await run_in_threadpool(self._whole, request.path_params["name"]))
-
-    async def remove(self, request: Request) -> Response:
+    def _remove(self, name: str) -> None:
         """Remove a person with everything."""
-        name = request.path_params["name"]
         self.people.folder(name)
+        self.maker.drop(name)
+        self.people.remove(name)
+        self.maker.forget(name)
 
-        def remove() -> None:
-            self.maker.drop(name)
-            self.people.remove(name)
-            self.maker.forget(name)
-
-        await run_in_threadpool(remove)
-        return JSONResponse({})
-
-    async def face(self, request: Request) -> Response:
-        """The picture that stands for a person."""
-        return self._file(self.people.folder(request.path_params["name"]) / "face.jpg")
-
-    async def set_face(self, request: Request) -> Response:
-        """Take that picture."""
+    async def _set_face(self, request: Request) -> Response:
         content = await body_of(request, 1 << 20)
         await run_in_threadpool(self.people.write_face, request.path_params["name"], content)
         return JSONResponse({})
 
-    async def begin_film(self, request: Request) -> Response:
-        """Begin a film."""
+    async def _begin_film(self, request: Request) -> Response:
         ending = str((await json_of(request)).get("ending", ""))
         film = await run_in_threadpool(self.people.begin_film, request.path_params["name"], ending)
         return JSONResponse({"film": film}, HTTPStatus.CREATED)
 
-    async def append(self, request: Request) -> Response:
-        """Take a piece of a film."""
+    async def _append(self, request: Request) -> Response:
         return await append(request, self.people, request.path_params["name"], request.path_params["film"])
 
-    async def finish_film(self, request: Request) -> Response:
-        """End a film."""
-        await json_of(request)
-        given = request.path_params
-        return JSONResponse(await run_in_threadpool(self.people.finish_film, given["name"], given["film"]))
-
-    async def remove_film(self, request: Request) -> Response:
-        """Remove a film."""
-        given = request.path_params
-        await run_in_threadpool(self.people.remove_film, given["name"], given["film"])
-        return JSONResponse({})
-
-    async def film(self, request: Request) -> Response:
-        """A film, or the part of it that the browser plays."""
-        return self._file(self.people.film(request.path_params["name"], request.path_params["film"]))
-
-    async def make(self, request: Request) -> Response:
-        """Put a person into the queue."""
-        settings = decode(Settings, await json_of(request), "settings", "choose again")
+    async def _make(self, request: Request) -> Response:
+        settings = Settings.of(await json_of(request))
         await run_in_threadpool(self.maker.add, request.path_params["name"], settings)
         return JSONResponse({}, HTTPStatus.ACCEPTED)
 
-    async def stop(self, request: Request) -> Response:
-        """Stop the work on a person."""
-        self.people.folder(request.path_params["name"])
-        await run_in_threadpool(self.maker.drop, request.path_params["name"])
-        return JSONResponse({})
-
-    async def growing(self, request: Request) -> Response:
-        """The avatar while it trains."""
-        name = request.path_params["name"]
-        self.people.folder(name)
-        return self._file(self.maker.growing(name))
-
-    async def fit(self, request: Request) -> Response:
-        """The page that shows the fit of the face while it runs."""
-        return self._file(self.people.folder(request.path_params["name"]) / "tracking_preview.html")
-
-    async def prepare(self, request: Request) -> Response:
+    def _prepare(self, name: str, kind: str) -> None:
         """Have a file written that is taken away."""
-        await json_of(request)
-        await run_in_threadpool(take, *self._taken(request))
-        return JSONResponse({})
+        self._taken(name, kind, take)
 
-    async def take(self, request: Request) -> Response:
+    def _taken(self, name: str, kind: str, of: Callable[..., Path | None] = place_of) -> Path:
         """A file that is taken away: for a frame of the page, or to be saved."""
-        folder, run, kind = self._taken(request)
-        found = place_of(folder, run, kind)
+        run = self.maker.run_of(name)
+        found = of(self.people.folder(name), run, kind) if run is not None and kind in TAKINGS else None
         if found is None:
-            raise NotThereError(f"{kind}: is not there yet; prepare it first")
-        saved = f"{folder.name} {found.name}" if "save" in request.query_params else None
-        return self._file(found, saved)
+            raise NotThereError(f"{kind:.40}: is not there yet; prepare it first")
+        return found
 
-    async def open_phone(self, request: Request) -> Response:
+    def _invite(self, name: str) -> dict[str, str]:
         """Let a phone send a film of a person, once."""
-        await json_of(request)
         if self.phones is None:
             raise UserError("phones cannot reach this studio; start it with `mien studio DIR --lan`")
-        self.people.folder(request.path_params["name"])
-        return JSONResponse(self.phones.invite(request.path_params["name"]))
+        self.people.folder(name)
+        return self.phones.invite(name)
 
-    async def close_phone(self, request: Request) -> Response:
-        """End the invitation."""
+    def _uninvite(self, name: str) -> None:
         if self.phones is not None:
-            self.phones.end(request.path_params["name"])
-        return JSONResponse({})
+            self.phones.end(name)
 
     def _short(self, name: str) -> dict[str, Any]:
+        """What the list shows of a person."""
         folder, progress = self.people.folder(name), self.maker.progress(name)
-        face = folder / "face.jpg"
         newest = max(path.stat().st_mtime for path in (folder, *folder.glob("me.html"), *folder.glob("films")))
+        made = self.maker.run_of(name) is not None
         return {
-            "name": name, "face": face.stat().st_mtime_ns if face.is_file() else None, "changed": round(newest),
-            "progress": asdict(progress), "made": self.maker.run_of(name) is not None,
+            "name": name, "face": _changed(folder / "face.jpg"), "changed": round(newest), "made": made,
+            "progress": asdict(progress),
         }  # fmt: skip
 
     def _whole(self, name: str) -> dict[str, Any]:
+        """Everything about a person."""
         folder, run, noted = self.people.folder(name), self.maker.run_of(name), self.people.read(name)
-        growing, fit = self.maker.growing(name), folder / "tracking_preview.html"
+        ready = {} if run is None else {kind: place_of(folder, run, kind) is not None for kind in TAKINGS}
         takings = [
-            {"kind": kind, "title": each.title, "opens": each.opens, "ready": place_of(folder, run, kind) is not None}
-            for kind, each in TAKINGS.items()
-            if run is not None and (each.options is not None or place_of(folder, run, kind) is not None)
+            {"kind": kind, "title": TAKINGS[kind].title, "opens": TAKINGS[kind].opens, "ready": is_ready}
+            for kind, is_ready in ready.items()
+            if is_ready or TAKINGS[kind].options is not None
         ]
         return {
             **self._short(name), "takings": takings, "settings": noted.get("settings", asdict(Settings())),
             "films": [{**asdict(film), "facts": dict(film.facts)} for film in self.people.films(name)],
-            "growing": growing.stat().st_mtime_ns if growing.is_file() else None,
-            "fit": fit.stat().st_mtime_ns if fit.is_file() else None,
+            "growing": _changed(self.maker.growing(name)), "fit": _changed(folder / "tracking_preview.html"),
             "advice": advice_for(folder / "me.mien") if run is not None else [],
             "phone": None if self.phones is None else self.phones.state(name),
         }  # fmt: skip
 
-    def _taken(self, request: Request) -> tuple[Path, str, str]:
-        name, kind = request.path_params["name"], request.path_params["kind"]
-        folder, run = self.people.folder(name), self.maker.run_of(name)
-        if kind not in TAKINGS or run is None:
-            raise NotThereError(f"{kind:.40}: {name} has nothing of this kind yet")
-        return folder, run, kind
 
-    def _file(self, path: Path, saved: str | None = None) -> Response:
-        check_unlinked(path)
-        if not path.is_file():
-            raise NotThereError(f"{path.name}: is not there yet")
-        return FileResponse(path, filename=saved, headers={"Content-Security-Policy": _FRAMED})
+def _changed(path: Path) -> int | None:
+    """When a file changed, as a mark for the page; None if it is missing."""
+    return path.stat().st_mtime_ns if path.is_file() else None
 
 
-@cache
-def _landmarker() -> Mapping[str, bytes]:
-    return webcam_files()
+_landmarker_files = cache(webcam_files)
+
+
+async def _landmarker(request: Request) -> Response:
+    """A part of the face landmarker that the page runs."""
+    part = (await run_in_threadpool(_landmarker_files)).get(request.path_params["part"])
+    if part is None:
+        raise NotThereError("there is no such part of the landmarker")
+    return Response(part, media_type="application/octet-stream")
 
 
 async def _failed(request: Request, error: Exception) -> Response:

@@ -6,10 +6,11 @@ however that ends, and the commands of a row continue where they stopped. So the
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from mien.avatar.methods import DEFAULT_METHOD, has_method, method_names
 from mien.batch.plan import Batch, Options, Row, State, with_fingerprint
@@ -32,7 +33,6 @@ _SHARES = {
 _KNOWN_SHARE, _KNOWN_SECONDS = 0.04, 30.0
 """How much of the work, and how long, this attempt must have taken before its own pace says how long the rest takes."""
 _MOST_THREADS = 256
-_STOP_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,11 @@ class Settings:
     """Threads of the computation; 0 takes all."""
     keep_film: bool = True
     """Whether the film and its frames stay after the avatar is made."""
+
+    @staticmethod
+    def of(content: Mapping[str, Any]) -> "Settings":
+        """The settings that a page or a note has. What is missing has its default."""
+        return decode(Settings, {**asdict(Settings()), **content}, "settings", "choose again")
 
     def check(self) -> None:
         """Check that all values are possible."""
@@ -104,6 +109,7 @@ class Maker:
         self.batch = Batch(people.root / ".studio")
         self._change, self._wake = threading.Lock(), threading.Event()
         self._running: str | None = None
+        self._printed = 0  # bytes of the log before this attempt
         self._pace: _Pace | None = None
         self._ended = False
         if not (self.batch.root / "plan.json").is_file():
@@ -143,12 +149,9 @@ class Maker:
         with self._change:
             self._queue = [row for row in self._queue if row.name != name]
             self.batch.write_plan(self._queue)
-        until = time.monotonic() + _STOP_SECONDS
-        while self._running == name and time.monotonic() < until:
+        while self._running == name:  # a row's process ends by force after ten seconds
             stop_attempts()
             time.sleep(0.05)
-        if self._running == name:
-            raise UserError(f"{name}: has not stopped yet; wait a moment and try again")
 
     def forget(self, name: str) -> None:
         """Remove what the queue knows of a person. They are not in it any more."""
@@ -164,8 +167,7 @@ class Maker:
         with self._change:
             queue = [row.name for row in self._queue]
         if name in queue and name == self._running:
-            stage = stage_of(self.batch.log_file(name))
-            pace = self._pace
+            stage, pace = stage_of(self.batch.log_file(name), self._printed), self._pace
             return Progress("making", stage, pace.seconds_left(stage, time.monotonic()) if pace else None)
         if name in queue:
             return Progress("waiting", before=queue.index(name))
@@ -193,8 +195,7 @@ class Maker:
         create = ("create", *map(str, paths), "--out", str(folder), *choices)
         create += ("--growing", str(self.growing(name).resolve()), "--preview")
         export = ("export", str(folder), "--run", run, "--out", str(folder / "me.mien"))
-        labels = {key: str(value) for key, value in asdict(settings).items()}
-        return with_fingerprint(Row(name, (create, export), labels), paths)
+        return with_fingerprint(Row(name, (create, export), {"quality": settings.quality}), paths)
 
     def _work(self) -> None:
         while not self._ended:
@@ -207,14 +208,16 @@ class Maker:
                 continue
             try:
                 self._make(row)
-            except (UserError, OSError) as error:  # the disk is full, or the folder is gone
+            except Exception as error:  # the disk is full, or the folder is gone; the others are made all the same
                 tell(f"mien: {row.name}: {error}")
                 self._conclude(row, None)
             finally:
                 self._running = None
 
     def _make(self, row: Row) -> None:
-        settings = decode(Settings, self.people.read(row.name).get("settings", {}))
+        log = self.batch.log_file(row.name)
+        self._printed = log.stat().st_size if log.is_file() else 0
+        settings = Settings.of(self.people.read(row.name).get("settings", {}))
         self.growing(row.name).parent.mkdir(exist_ok=True)
         self.growing(row.name).unlink(missing_ok=True)
         self._pace = _Pace(settings.quality, self._usual(settings.quality))
@@ -240,10 +243,9 @@ class Maker:
                 self.batch.write_plan(self._queue)
         if state is not None and state.status == "done":
             with suppress(UserError, OSError):
-                self.people.write(row.name, took=[row.labels["quality"], round(state.seconds)])
+                self.people.write(row.name, took={row.labels["quality"]: round(state.seconds)})
 
     def _usual(self, quality: str) -> float | None:
-        """How long the last avatar of that quality took on this machine; None if there is none."""
-        took = (self.people.read(name).get("took") for name in self.people.names())
-        found = [seconds for one in took if one for name, seconds in [one] if name == quality]
-        return found[-1] if found else None
+        """How many seconds an avatar of that quality took here at the most; None if there is none."""
+        took = (self.people.read(name).get("took", {}).get(quality) for name in self.people.names())
+        return max((float(seconds) for seconds in took if seconds is not None), default=None)

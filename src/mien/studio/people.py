@@ -93,10 +93,6 @@ class People:
             raise UserError(f"{name}: there is such a person or folder already; give another name, or open that one")
         if len(self.names()) >= _MOST_PEOPLE:
             raise FullError(f"{self.root}: holds {_MOST_PEOPLE} people; start a studio in another folder")
-        try:
-            (self.root / name).mkdir()
-        except OSError as error:
-            raise cannot_write(self.root / name, error) from None
         self.write(name, agreed=round(time.time()))
 
     def read(self, name: str) -> dict[str, Any]:

@@ -20,9 +20,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from mien.errors import UserError
-from mien.studio.people import FullError, NotThereError, People
-
-_MOST_INVITED = 20
+from mien.studio.app import answered, append, json_of, page_response
+from mien.studio.people import NotThereError, People
 
 
 @dataclass
@@ -49,8 +48,6 @@ class Phones:
         """Invite a phone, and return the address and its QR code as svg. An earlier invitation of the person ends."""
         invited = Invitation(name, secrets.token_urlsafe(18))
         with self._change:
-            if len(self._invited) >= _MOST_INVITED and name not in self._invited:
-                raise FullError("too many phones are invited; end an invitation first")
             self._invited[name] = invited
         url = f"{self.address}/{invited.token}/"
         code = segno.make(url, error="m").svg_inline(scale=6, border=4, dark="#000", light="#fff")
@@ -65,19 +62,17 @@ class Phones:
         """Whether a phone is invited to film a person, and how far its film is; None without an invitation."""
         with self._change:
             invited = self._invited.get(name)
-        if invited is None:
-            return None
-        return {"film": invited.film, "done": invited.done}
+        return None if invited is None else {"film": invited.film, "done": invited.done}
 
     def app(self) -> Starlette:
         """The answers to phones."""
-        from mien.studio.app import answered
-
         routes = (
             ("GET", "/{token}/", self._page), ("POST", "/{token}/begin", self._begin),
             ("PUT", "/{token}/piece", self._append), ("POST", "/{token}/done", self._done),
         )  # fmt: skip
-        return Starlette(routes=[Route(path, answered(answer), methods=[method]) for method, path, answer in routes])
+        app = Starlette(routes=[Route(path, answered(answer), methods=[method]) for method, path, answer in routes])
+        app.router.redirect_slashes = False
+        return app
 
     def _invitation(self, request: Request) -> Invitation:
         token = request.path_params["token"].encode()
@@ -88,14 +83,10 @@ class Phones:
         raise NotThereError("this address has ended; ask for a new code in the studio")
 
     async def _page(self, request: Request) -> Response:
-        from mien.studio.app import page_response
-
         self._invitation(request)
         return page_response("phone.html")
 
     async def _begin(self, request: Request) -> Response:
-        from mien.studio.app import json_of
-
         invited, ending = self._invitation(request), str((await json_of(request)).get("ending", ""))
         if invited.film is not None:
             await run_in_threadpool(self._forget_film, invited)  # the phone has lost its connection, and begins anew
@@ -103,16 +94,12 @@ class Phones:
         return JSONResponse({}, HTTPStatus.CREATED)
 
     async def _append(self, request: Request) -> Response:
-        from mien.studio.app import append
-
         invited = self._invitation(request)
         if invited.film is None:
             raise UserError("the film has not begun; begin it first")
         return await append(request, self.people, invited.name, invited.film)
 
     async def _done(self, request: Request) -> Response:
-        from mien.studio.app import json_of
-
         invited = self._invitation(request)
         await json_of(request)
         if invited.film is None:

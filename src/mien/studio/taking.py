@@ -58,8 +58,8 @@ def take(folder: Path, run: str, kind: str) -> Path:
     with _exporting:
         found = place_of(folder, run, kind)
         if found is None and taking.options is not None:
-            command = [sys.executable, "-m", "mien.cli", "export", str(folder), "--run", run]
-            command += ["--out", str(folder / taking.file), *taking.options]
+            words = ("export", str(folder), "--run", run, "--out", str(folder / taking.file), *taking.options)
+            command = [sys.executable, "-m", "mien.cli", *words]
             try:
                 done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS, check=False)
             except subprocess.TimeoutExpired:

@@ -123,6 +123,8 @@ async function film(): Promise<void> {
   fillRings(own.guide);
   showStage();
   find("request").textContent = "Opening the camera. Allow it if the browser asks.";
+  find("clock").textContent = "";
+  button("record").disabled = true;
   own.onEnd = (why) => void attempt(async () => {
     say(why, 20);
     await endFilm(true);
@@ -136,6 +138,7 @@ async function film(): Promise<void> {
     throw error;
   }
   showStage();
+  button("record").disabled = false;
   button("record").focus();
 }
 
@@ -146,7 +149,8 @@ function showGuide(own: Filming): void {
   if (fault && told.dataset.words !== fault.words) told.replaceChildren(fault.words, make("span", {}, fault.remedy));
   told.dataset.words = fault?.words ?? "";
   if (!recording) return;
-  find("request").textContent = `${guide.request} · ${Math.floor(guide.seconds)} s`;
+  if (find("request").textContent !== guide.request) find("request").textContent = guide.request;
+  find("clock").textContent = `0:${`${Math.floor(guide.seconds)}`.padStart(2, "0")}`;
   if (guide.done) void attempt(() => endFilm(true));
 }
 
