@@ -47,6 +47,11 @@ export class Filming {
     return this.recorder?.state === "recording";
   }
 
+  /** Bytes of the film that are on the disk. */
+  get sent(): number {
+    return this.sending?.sent ?? 0;
+  }
+
   /** Opens the camera at its best, and begins to look. */
   async open(): Promise<void> {
     const stream = (this.stream = await camera({ width: { ideal: 1920 }, height: { ideal: 1080 } }));

@@ -150,7 +150,8 @@ function showGuide(own: Filming): void {
   told.dataset.words = fault?.words ?? "";
   if (!recording) return;
   if (find("request").textContent !== guide.request) find("request").textContent = guide.request;
-  find("clock").textContent = `0:${`${Math.floor(guide.seconds)}`.padStart(2, "0")}`;
+  const saved = own.sent ? ` · ${sizeOf(own.sent)} saved` : "";
+  find("clock").textContent = `0:${`${Math.floor(guide.seconds)}`.padStart(2, "0")}${saved}`;
   if (guide.done) void attempt(() => endFilm(true));
 }
 
