@@ -224,7 +224,9 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return files
 
 
-def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_states_are_written_from_time_to_time(
+    started: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     """What cannot be shown is said once."""
     now = [100.0]
     monkeypatch.setattr(view_training.time, "monotonic", lambda: now[0])
@@ -245,9 +247,14 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
         other(new_avatar("headgas", variant="delta"))
     other.close()
     told = capsys.readouterr().err
-    assert told.count("--view: the avatar cannot be shown") == 1
-    assert "training goes on without a viewer" in told
+    assert told.count("the growing avatar cannot be shown") == 1
+    assert "training goes on without that" in told
     assert len(started) == 1
+    growing = TrainingView("toy", toy_camera(32), tmp_path / "growing.mien", viewer=False)
+    growing(avatar)
+    growing.close()
+    assert (tmp_path / "growing.mien").is_file(), "it stays"
+    assert len(started) == 1, "nobody asked for a viewer"
 
 
 def test_a_watched_training_has_the_same_bytes(started: list[Path], tmp_path: Path, monkeypatch) -> None:
