@@ -91,7 +91,7 @@ OF_A_RUN = {
     "export-dataset": "{toy} --out {out}/data --format insta", "import": "{exported} --out {out}/imported",
     "face-models": "--json", "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
 }  # fmt: skip
-"""Lines of every command but two: `demo` makes the subject, and `view` has a test of its own."""
+"""Lines of every command but three: `demo` makes the subject, and `studio` and `view` have tests of their own."""
 _FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
 
 
@@ -111,7 +111,7 @@ def run_all(server: ForkServer, lines: dict[str, str], **given: object) -> None:
 
 
 def test_no_command_needs_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "view"} == set(COMMANDS)
+    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "studio", "view"} == set(COMMANDS)
     video = offline / VIDEO
     (tmp_path / "table.csv").write_text(f"video\n{video}\n")
     table, stub = tmp_path / "table.csv", " ".join(PROGRAM)
