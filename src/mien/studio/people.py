@@ -131,17 +131,18 @@ class People:
         """Begin a film, and return its name."""
         if ending not in ENDINGS:
             raise UserError(f".{ending!s:.20}: is no film; give a file that ends in .{', .'.join(ENDINGS)}")
-        films = self.films(name)
-        if len(films) >= _MOST_FILMS:
-            raise FullError(f"{name}: has {_MOST_FILMS} films; remove one first")
         folder = self.folder(name) / "films"
-        try:
-            folder.mkdir(exist_ok=True)
-            check_unlinked(folder)
+        with _changing:
+            films = self.films(name)
+            if len(films) >= _MOST_FILMS:
+                raise FullError(f"{name}: has {_MOST_FILMS} films; remove one first")
             film = f"film_{max((each.number for each in films), default=0) + 1}.{ending}"
-            open_new(_part(folder, film)).close()
-        except OSError as error:
-            raise cannot_write(folder, error) from None
+            try:
+                folder.mkdir(exist_ok=True)
+                check_unlinked(folder)
+                open_new(_part(folder, film)).close()
+            except OSError as error:
+                raise cannot_write(folder, error) from None
         return film
 
     def append(self, name: str, film: str, at: int, piece: bytes) -> int:

@@ -31,7 +31,7 @@ class Guard:
     """Asks the door about each request of this machine's browsers, and the host about each of phones."""
 
     def __init__(self, door: Door, port: int, app: ASGIApp, phones: Phones | None) -> None:
-        """Guard the answers of `app` at a port of loopback, and those of `phones` at every other one."""
+        """Guard the answers of `app` at a port of loopback, and those of `phones` at every other socket."""
         self._door, self._port, self._app = door, port, app
         self._for_phones = None if phones is None else phones.app()
         self._host_of_phones = "" if phones is None else urlsplit(phones.address).netloc
@@ -50,7 +50,7 @@ class Guard:
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         host, origin = headers.get("host", ""), headers.get("origin")
-        if scope["server"][1] != self._port:
+        if tuple(scope["server"]) != (self._door.host, self._port):
             known = self._for_phones is not None and host == self._host_of_phones
             if not known or origin not in (None, f"http://{host}") or self._for_phones is None:
                 await _refuse(guarded, HTTPStatus.FORBIDDEN, _STRANGE)

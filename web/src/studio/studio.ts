@@ -4,7 +4,7 @@ import { addTurning, fit } from "../controls";
 import { readMien } from "../format";
 import { Viewer } from "../viewer";
 import { Webcam, WORDS } from "../webcam";
-import { ask, endingOf, person, Sending, type Film, type Listed, type Progress, type Settings, type Short, type Whole } from "./api";
+import { ask, endingOf, person, Refused, Sending, type Film, type Listed, type Progress, type Settings, type Short, type Whole } from "./api";
 import { check, Filming, PARTS } from "./filming";
 import { attempt, busy, button, duration, fill, find, make, on, press, say } from "./page";
 import { addRings } from "./rings";
@@ -346,6 +346,7 @@ async function look(): Promise<void> {
     if (name) find("nobody").hidden = true;
   } catch (error) {
     say((error as Error).message);
+    if (error instanceof Refused && error.status === 404) go("");
   } finally {
     clearTimeout(waiting);
     waiting = window.setTimeout(look, soon ? SOON : LATER);
