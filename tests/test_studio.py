@@ -49,7 +49,8 @@ def test_strangers_are_refused_and_the_server_lives(serving: Serving) -> None:
     own = f"127.0.0.1:{serving.port}"
     for method, path in (("GET", "/"), ("GET", "/api/people"), ("POST", "/api/people"), ("DELETE", person("Ada"))):
         for headers in (
-            {"Cookie": ""}, {"Cookie": serving.door.cookie[:-1]}, {"Host": "evil.example"}, {"Host": "127.0.0.1:80"},
+            {"Cookie": ""}, {"Cookie": serving.door.cookie[:-1]}, {"Host": "evil.example", "Origin": "http://evil.example"},
+            {"Host": "evil.example", "Origin": ""}, {"Host": "127.0.0.1:80"},
             {"Host": f"127.0.0.1.evil.example:{serving.port}"}, {"Origin": "http://evil.example"}, {"Origin": "null"},
             {"Origin": f"https://{own}"[:-1]}, {"Host": f"localhost:{serving.port}"},
         ):  # fmt: skip
