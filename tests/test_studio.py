@@ -84,7 +84,7 @@ def test_hostile_names_paths_and_sizes_go_nowhere(serving: Serving, tmp_path: Pa
     assert told(serving, "POST", "/api/people", {"name": "Ada"}) == (
         400, {"error": "the person has to agree before the first recording; ask, and confirm it"}
     )  # fmt: skip
-    assert told(serving, "POST", "/api/people", {"name": "Zoë O'Neil-2", **add})[0] == 201
+    assert told(serving, "POST", "/api/people", {"name": "Zoë O'Neil-2", **add})[0] == 200
     assert told(serving, "POST", "/api/people", {"name": "zoë o'neil-2", **add})[0] == 400, "the same on some disks"
     zoe, outside = person("Zoë O'Neil-2"), tmp_path / "secret.txt"
     outside.write_text("secret")
@@ -99,7 +99,7 @@ def test_hostile_names_paths_and_sizes_go_nowhere(serving: Serving, tmp_path: Pa
     assert asked(serving, "POST", f"{zoe}/films", b'{"ending": "mp4"}', Content_Type="text/plain")[0] == 400
     assert asked(serving, "POST", f"{zoe}/films", b"[" * 9000, Content_Type="application/json")[0] == 400
     assert asked(serving, "POST", f"{zoe}/films", b" " * 20_000, Content_Type="application/json")[0] == 507
-    assert told(serving, "POST", f"{zoe}/films", {"ending": "mp4"}) == (201, {"film": "film_1.mp4"})
+    assert told(serving, "POST", f"{zoe}/films", {"ending": "mp4"}) == (200, {"film": "film_1.mp4"})
     part = f"{zoe}/films/film_1.mp4"
     for at, size, status in (("1", 5, 409), ("x", 5, 400), ("-1", 5, 400), ("9" * 16, 5, 400), ("9" * 12, 5, 507)):
         assert told(serving, "PUT", f"{part}?at={at}", b"." * size)[0] == status, at
@@ -120,7 +120,7 @@ def test_hostile_names_paths_and_sizes_go_nowhere(serving: Serving, tmp_path: Pa
 
 def test_a_film_arrives_in_pieces_and_a_closed_tab_loses_nothing(serving: Serving, film: Path) -> None:
     content, ada = film.read_bytes(), person("Ada")
-    assert told(serving, "POST", "/api/people", {"name": "Ada", "agreed": True})[0] == 201
+    assert told(serving, "POST", "/api/people", {"name": "Ada", "agreed": True})[0] == 200
     _, begun = told(serving, "POST", f"{ada}/films", {"ending": "mp4"})
     _, other = told(serving, "POST", f"{ada}/films", {"ending": "mp4"})
     assert [begun["film"], other["film"]] == ["film_1.mp4", "film_2.mp4"], "two tabs"
@@ -156,7 +156,7 @@ def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) ->
         give_film(people, name, film)
     for name in ("Ada", "Bob"):
         chosen = {"quality": "draft", "threads": 1, "method": "headgas", "keep_film": name == "Bob"}
-        assert told(serving, "POST", f"{person(name)}/making", chosen)[0] == 202
+        assert told(serving, "POST", f"{person(name)}/making", chosen)[0] == 200
     assert told(serving, "POST", f"{person('Bob')}/making", {})[0] == 400, "it waits already"
     until(lambda: (told(serving, "GET", person("Ada"))[1]["progress"]["stage"] or {}).get("percent") == 20)
     shown = told(serving, "GET", person("Ada"))[1]
@@ -165,7 +165,7 @@ def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) ->
     assert told(serving, "DELETE", f"{person('Ada')}/making")[0] == 200
     assert state_of(serving, "Ada") == "stopped"
     until(lambda: state_of(serving, "Bob") == "making")
-    assert told(serving, "POST", f"{person('Ada')}/making", shown["settings"])[0] == 202
+    assert told(serving, "POST", f"{person('Ada')}/making", shown["settings"])[0] == 200
     log = (people.root / ".studio" / "logs" / "Ada.log").read_text()
     for words in ("'--preset', 'draft'", "'--method', 'headgas'", "'--run', 'draft_headgas_1'", "film_1.mp4"):
         assert words in log
@@ -173,7 +173,7 @@ def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) ->
     until(lambda: state_of(serving, "Ada") == "done")
     assert state_of(serving, "Bob") == "done"
     assert [len(people.films(name)) for name in ("Ada", "Bob")] == [0, 1], "the film stays if it is to be kept"
-    assert told(serving, "POST", f"{person('Bad')}/making", {})[0] == 202
+    assert told(serving, "POST", f"{person('Bad')}/making", {})[0] == 200
     until(lambda: state_of(serving, "Bad") == "failed")
     assert "no face is found" in told(serving, "GET", person("Bad"))[1]["progress"]["error"]
     assert told(serving, "DELETE", person("Bob"))[0] == 200
@@ -219,7 +219,7 @@ def test_a_phone_sends_one_film_and_reaches_nothing_else(
 ) -> None:
     monkeypatch.setattr(server, "address_on_network", lambda: "127.0.0.2")
     with studio(tmp_path / "people", lan=True) as serving:
-        assert told(serving, "POST", "/api/people", {"name": "Ada", "agreed": True})[0] == 201
+        assert told(serving, "POST", "/api/people", {"name": "Ada", "agreed": True})[0] == 200
         _, invited = told(serving, "POST", f"{person('Ada')}/phone", {})
         assert invited["svg"].startswith("<svg")
         found = re.fullmatch(r"http://(127\.0\.0\.2:(\d+))(/[\w-]{20,})/", invited["url"])
@@ -233,7 +233,7 @@ def test_a_phone_sends_one_film_and_reaches_nothing_else(
         assert b"Film yourself with this phone" in asked(serving, "GET", f"{base}/", **there)[2]
         assert asked(serving, "PUT", f"{base}/piece?at=0", b"x", **there)[0] == 400
         for _ in range(2):  # the first one loses its connection
-            assert asked(serving, "POST", f"{base}/begin", {"ending": "mp4"}, **there)[0] == 201
+            assert asked(serving, "POST", f"{base}/begin", {"ending": "mp4"}, **there)[0] == 200
         assert asked(serving, "PUT", f"{base}/piece?at=0", film.read_bytes(), **there)[0] == 200
         assert told(serving, "GET", person("Ada"))[1]["phone"] == {"film": "film_1.mp4", "done": False}
         assert asked(serving, "POST", f"{base}/done", {}, **there)[0] == 200

@@ -149,7 +149,7 @@ def test_the_page_can_be_used_by_everybody(tmp_path: Path, test_data: Path) -> N
     with studio(root) as serving:
         for name in ("Ada", "Bad"):
             give_film(people, name, test_data / "cases" / "plain.mp4")
-            assert told(serving, "POST", f"{person(name)}/making", {})[0] == 202
+            assert told(serving, "POST", f"{person(name)}/making", {})[0] == 200
         until(lambda: told(serving, "GET", person("Ada"))[1]["progress"]["state"] == "making")
         settled = "await new Promise((done) => setTimeout(done, 1500));"
         steps = ['document.querySelector("#new").click();', 'document.querySelector("#not-adding").click();']

@@ -111,16 +111,16 @@ async def append(request: Request, people: People, name: str, film: str) -> Resp
     return JSONResponse({"size": await run_in_threadpool(people.append, name, film, int(place), piece)})
 
 
-def does(act: Callable[..., Any], status: HTTPStatus = HTTPStatus.OK) -> Answering:
+def does(act: Callable[..., Any], reads: bool = False) -> Answering:
     """An answer that calls a function with what the path names, in a thread, and sends what it returns as json.
 
-    A POST has to bring json, which no form of another page can send.
+    A POST has to bring json, which no form of another page can send. With `reads`, the function gets it as `content`.
     """
 
     async def doing(request: Request) -> Response:
-        if request.method == "POST":
-            await json_of(request)
-        return JSONResponse(await run_in_threadpool(act, **request.path_params) or {}, status)
+        content = await json_of(request) if request.method == "POST" else {}
+        given = {**request.path_params, **({"content": content} if reads else {})}
+        return JSONResponse(await run_in_threadpool(act, **given) or {})
 
     return doing
 
@@ -149,14 +149,15 @@ class Studio:
         taken = "/api/people/{name}/take/{kind}"
         routes: list[tuple[str, str, Answering]] = [
             ("GET", "/", self._home), ("GET", "/index.html", self._home), ("GET", "/landmarker/{part}", _landmarker),
-            ("GET", "/api/people", does(self._list)), ("POST", "/api/people", self._add),
+            ("GET", "/api/people", does(self._list)), ("POST", "/api/people", does(self._add, reads=True)),
             ("GET", person, does(self._whole)), ("DELETE", person, does(self._remove)),
             ("GET", f"{person}/face", sends(lambda name: people.folder(name) / "face.jpg")),
-            ("PUT", f"{person}/face", self._set_face), ("POST", f"{person}/films", self._begin_film),
+            ("PUT", f"{person}/face", self._set_face),
+            ("POST", f"{person}/films", does(self._begin_film, reads=True)),
             ("PUT", film, self._append), ("POST", film, does(people.finish_film)),
             ("DELETE", film, does(people.remove_film)), ("GET", film, sends(people.film)),
-            ("POST", f"{person}/making", self._make), ("DELETE", f"{person}/making", does(maker.drop)),
-            ("GET", f"{person}/growing", sends(maker.growing)),
+            ("POST", f"{person}/making", does(self._make, reads=True)),
+            ("DELETE", f"{person}/making", does(maker.drop)), ("GET", f"{person}/growing", sends(maker.growing)),
             ("GET", f"{person}/fit", sends(lambda name: people.folder(name) / "tracking_preview.html")),
             ("POST", taken, does(self._prepare)), ("GET", taken, sends(self._taken)),
             ("POST", f"{person}/phone", does(self._invite)), ("DELETE", f"{person}/phone", does(self._uninvite)),
@@ -175,16 +176,15 @@ class Studio:
         people = [self._short(name) for name in self.people.names()]
         return {"folder": self.people.root.resolve().name, "people": people, "offered": offered}
 
-    async def _add(self, request: Request) -> Response:
+    def _add(self, content: Mapping[str, Any]) -> dict[str, str]:
         """Add a person, who must have agreed."""
-        content = await json_of(request)
         name = content.get("name")
         if content.get("agreed") is not True:
             raise UserError("the person has to agree before the first recording; ask, and confirm it")
         if not isinstance(name, str):
             raise UserError("the request has no name; give one")
-        await run_in_threadpool(self.people.add, name.strip())
-        return JSONResponse({"name": name.strip()}, HTTPStatus.CREATED)
+        self.people.add(name.strip())
+        return {"name": name.strip()}
 
     def _remove(self, name: str) -> None:
         """Remove a person with everything."""
@@ -198,18 +198,14 @@ class Studio:
         await run_in_threadpool(self.people.write_face, request.path_params["name"], content)
         return JSONResponse({})
 
-    async def _begin_film(self, request: Request) -> Response:
-        ending = str((await json_of(request)).get("ending", ""))
-        film = await run_in_threadpool(self.people.begin_film, request.path_params["name"], ending)
-        return JSONResponse({"film": film}, HTTPStatus.CREATED)
+    def _begin_film(self, name: str, content: Mapping[str, Any]) -> dict[str, str]:
+        return {"film": self.people.begin_film(name, str(content.get("ending", "")))}
 
     async def _append(self, request: Request) -> Response:
         return await append(request, self.people, request.path_params["name"], request.path_params["film"])
 
-    async def _make(self, request: Request) -> Response:
-        settings = Settings.of(await json_of(request))
-        await run_in_threadpool(self.maker.add, request.path_params["name"], settings)
-        return JSONResponse({}, HTTPStatus.ACCEPTED)
+    def _make(self, name: str, content: Mapping[str, Any]) -> None:
+        self.maker.add(name, Settings.of(content))
 
     def _prepare(self, name: str, kind: str) -> None:
         """Have a file written that is taken away."""

@@ -24,12 +24,10 @@ from mien.studio.people import People
 
 QUALITIES = ("draft", "standard", "fine")
 """The presets that a page offers; those of papers take days."""
-_SHARES = {
-    "draft": {"capture": 18, "tracking": 80, "alignment": 83, "training": 190, "scoring": 28, "": 8},
-    "standard": {"capture": 18, "tracking": 80, "alignment": 83, "training": 290, "scoring": 28, "": 8},
-    "fine": {"capture": 18, "tracking": 80, "alignment": 83, "training": 560, "scoring": 28, "": 8},
-}
-"""Seconds of each stage for 400 frames on two cores (docs/results.md); "" is the film and the file at the end."""
+_SHARES = {"capture": 18, "tracking": 80, "alignment": 83, "training": 290, "scoring": 28, "": 8}
+"""Seconds of each stage of `standard` on 400 frames, two cores (docs/results.md); "" is film and file at the end."""
+_TRAININGS = {"draft": 190, "fine": 560}
+"""The same for the trainings of other presets."""
 _KNOWN_SHARE, _KNOWN_SECONDS = 0.04, 30.0
 """How much of the work, and how long, this attempt must have taken before its own pace says how long the rest takes."""
 _MOST_THREADS = 256
@@ -80,7 +78,8 @@ class _Pace:
 
     def __init__(self, quality: str, usual: float | None) -> None:
         """Begin an attempt. `usual` is how long the whole work took on this machine; None if nothing was made yet."""
-        self._shares, self._usual = _SHARES[quality], usual
+        self._usual = usual
+        self._shares = {**_SHARES, "training": _TRAININGS.get(quality, _SHARES["training"])}
         self._began: tuple[float, float] | None = None
         self._done = 0.0
 

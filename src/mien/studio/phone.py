@@ -8,8 +8,8 @@ import hmac
 import secrets
 import socket
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
-from http import HTTPStatus
 from typing import Any
 
 import segno
@@ -91,7 +91,7 @@ class Phones:
         if invited.film is not None:
             await run_in_threadpool(self._forget_film, invited)  # the phone has lost its connection, and begins anew
         invited.film = await run_in_threadpool(self.people.begin_film, invited.name, ending)
-        return JSONResponse({}, HTTPStatus.CREATED)
+        return JSONResponse({})
 
     async def _append(self, request: Request) -> Response:
         invited = self._invitation(request)
@@ -115,12 +115,11 @@ class Phones:
             invited.film = None
 
 
-def address_on_network() -> str | None:
-    """The address of this machine on its local network; None if there is none. Nothing is sent."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        try:
-            asking.connect(("192.0.2.1", 9))  # an address for documentation: only the route to it is looked up
-        except OSError:
-            return None
+def address_on_network() -> str:
+    """The address of this machine on its local network. Nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking, suppress(OSError):
+        asking.connect(("192.0.2.1", 9))  # an address for documentation: only the route to it is looked up
         found = str(asking.getsockname()[0])
-    return None if found.startswith("127.") else found
+        if not found.startswith("127."):
+            return found
+    raise UserError("--lan: this machine is on no network; connect it, or leave --lan out")

@@ -2,17 +2,16 @@
 
 import contextlib
 import logging
-import socket
 import threading
 from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import uvicorn
+from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mien.disk.locks import hold
-from mien.errors import UserError
 from mien.studio.app import Studio
 from mien.studio.making import Maker
 from mien.studio.people import People
@@ -23,7 +22,9 @@ _HEADERS = {
     **HEADERS, "X-Frame-Options": "SAMEORIGIN", "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
 }  # fmt: skip
-_STRANGE = b"This address is not that of the studio. Open the whole address that mien printed.\n"
+_STRANGE = PlainTextResponse(
+    "This address is not that of the studio. Open the whole address that mien printed.\n", HTTPStatus.FORBIDDEN
+)
 _MOST_CONNECTIONS = 64
 
 
@@ -46,33 +47,19 @@ class Guard:
                 message["headers"] = [*message["headers"], *(pair for pair in added if pair[0] not in given)]
             await send(message)
 
-        if scope["type"] != "http":
-            return
+        if scope["type"] == "http":
+            await self._answer(scope)(scope, receive, guarded)
+
+    def _answer(self, scope: Scope) -> ASGIApp:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         host, origin = headers.get("host", ""), headers.get("origin")
         if tuple(scope["server"]) != (self._door.host, self._port):
-            known = self._for_phones is not None and host == self._host_of_phones
-            if not known or origin not in (None, f"http://{host}") or self._for_phones is None:
-                await _refuse(guarded, HTTPStatus.FORBIDDEN, _STRANGE)
-                return
-            await self._for_phones(scope, receive, guarded)
-            return
+            known = host == self._host_of_phones and origin in (None, f"http://{host}")
+            return self._for_phones if known and self._for_phones is not None else _STRANGE
         if host not in {f"{f'[{name}]' if ':' in name else name}:{self._port}" for name in LOOPBACK_NAMES}:
-            await _refuse(guarded, HTTPStatus.FORBIDDEN, _STRANGE)
-            return
-        path = scope["path"] + "?" + scope["query_string"].decode("latin-1")
-        told = self._door.answer(path, headers)
-        if told is not None:
-            await _refuse(guarded, told.status, told.body, **told.headers)
-            return
-        await self._app(scope, receive, guarded)
-
-
-async def _refuse(send: Send, status: HTTPStatus, body: bytes, **headers: str) -> None:
-    given = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), **headers}
-    start = [(name.lower().encode(), value.encode()) for name, value in given.items()]
-    await send({"type": "http.response.start", "status": status.value, "headers": start})
-    await send({"type": "http.response.body", "body": body})
+            return _STRANGE
+        told = self._door.answer(scope["path"] + "?" + scope["query_string"].decode("latin-1"), headers)
+        return self._app if told is None else Response(told.body, told.status, told.headers)
 
 
 class Serving:
@@ -89,27 +76,18 @@ class Serving:
             self.address = address_of(self.door, own)
             phones = None
             if lan:
-                sockets.append(closing.enter_context(contextlib.closing(_listen_on_network())))
+                sockets.append(closing.enter_context(contextlib.closing(listen(address_on_network(), 0))))
                 host, at = sockets[1].getsockname()[:2]
                 phones = Phones(people, f"http://{host}:{at}")
             self.phones, self.maker = phones, maker or Maker(people)
             guard = Guard(self.door, self.port, Studio(people, self.maker, phones).app, phones)
             logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # a client that vanishes is no error
-            self._server = uvicorn.Server(
-                uvicorn.Config(
-                    guard,
-                    log_config=None,
-                    access_log=False,
-                    lifespan="off",
-                    ws="none",
-                    http="h11",
-                    loop="asyncio",
-                    server_header=False,
-                    proxy_headers=False,
-                    limit_concurrency=_MOST_CONNECTIONS,
-                    timeout_graceful_shutdown=2,
-                )  # fmt: skip
-            )
+            config = uvicorn.Config(
+                guard, log_config=None, access_log=False, lifespan="off", ws="none", http="h11", loop="asyncio",
+                server_header=False, proxy_headers=False, limit_concurrency=_MOST_CONNECTIONS,
+                timeout_graceful_shutdown=2,
+            )  # fmt: skip
+            self._server = uvicorn.Server(config)
             self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": sockets}, daemon=True)
             self._thread.start()
             self.maker.start()
@@ -126,10 +104,3 @@ class Serving:
         self.maker.end()
         self._thread.join(10.0)
         self._closing.close()
-
-
-def _listen_on_network() -> socket.socket:
-    host = address_on_network()
-    if host is None:
-        raise UserError("--lan: this machine is on no network; connect it, or leave --lan out")
-    return listen(host, 0)

@@ -29,12 +29,7 @@ class Taking:
 
 TAKINGS = {
     "page": Taking("Page", "me.html", "Opens in every browser, from a disk or a mail. One file, no network.", None),
-    "webcam": Taking(
-        "Webcam page",
-        "be_me.html",
-        "The same, and the face in front of a camera drives it. Nothing leaves it.",
-        ("--webcam",),
-    ),
+    "webcam": Taking("Webcam page", "be_me.html", "The same, driven by a camera. Nothing leaves it.", ("--webcam",)),
     "film": Taking("Video", "me.mp4", "Plays everywhere: five seconds of the avatar.", None),
     "glb": Taking("GLB", "me.glb", "Opens in Blender, Unity, Unreal and Godot, with its expressions."),
     "mien": Taking("MIEN", "me.mien", "Opens with mien, in Python and in pages of your own. All of the avatar."),

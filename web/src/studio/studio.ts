@@ -27,6 +27,8 @@ let chosen = "";
 /** The camera that drives the avatar. */
 const webcam = new Webcam(() => PARTS);
 let detach = () => {};
+/** The films that this page is sending. */
+const sent = new Set<string>();
 /** What would make each film better, by its name. */
 const checked = new Map<string, string[]>();
 const video = () => find<HTMLVideoElement>("camera");
@@ -100,15 +102,19 @@ async function send(file: File): Promise<void> {
   if (!whole) return;
   const { name } = whole, told = find("sending");
   told.hidden = false;
+  let film = "";
   try {
-    const [sending, film] = await Sending.begin(name, endingOf(file.name));
+    const [sending, begun] = await Sending.begin(name, endingOf(file.name));
+    sent.add((film = begun));
     await sending.send(file, (sent) => (told.textContent = `${Math.round((100 * sent) / file.size)} % of ${sizeOf(file.size)}`));
     await ask("POST", person(name, "films", film), {});
+    sent.delete(film);
     await look();
     const source = URL.createObjectURL(file);
     await attempt(() => checkFilm(name, film, source));
     URL.revokeObjectURL(source);
   } finally {
+    sent.delete(film);
     told.hidden = true;
     await look();
   }
@@ -164,6 +170,7 @@ async function endFilm(keeps: boolean): Promise<void> {
     const made = await own.finish(keeps);
     if (made) checked.set(made, missing);
   } finally {
+    sent.delete(own.film);
     own.close();
     showStage();
     await look();
@@ -305,7 +312,7 @@ function showTakings(): void {
 function showPerson(): void {
   const { name, films } = whole!;
   if (find("title").textContent !== name) find("title").textContent = name;
-  const rows = films.map((each, k) => ({ each, number: k + 1 })).filter(({ each }) => each.name !== filming?.film);
+  const rows = films.map((each, k) => ({ each, number: k + 1 })).filter(({ each }) => !sent.has(each.name));
   fill("films", [rows, [...checked]], () => rows.map(({ each, number }) => filmRow(name, each, number)));
   for (const id of ["film", "choose", "from-phone"]) button(id).disabled = filming !== null;
   button("film").textContent = films.length ? "Film more" : "Film";
@@ -404,6 +411,7 @@ function connect(): void {
   start("film", film);
   start("record", async () => {
     await filming?.record(!whole?.face);
+    if (filming) sent.add(filming.film);
     showStage();
     button("finish").focus();
   });
