@@ -114,7 +114,7 @@ def walk(film: Path, out: Path, seconds: float) -> Walk:
         ready = [{"see": NAME}, "person", {"press": "#film"}, {"see": "Put your face"}, "camera", {"press": "#record"}]
         throw = ["recording", {"press": "#cancel"}, {"see": "Half a minute of film"}]
         code = [{"press": "#from-phone"}, {"see": "Scan the"}, "code"]
-        shown.show(*ready, {"see": " saved"}, {"wait": 6000}, *throw, *code)
+        shown.show(*ready, {"see": " saved"}, {"wait": 2000}, *throw, *code)
         keep = [{"see": " saved"}, {"wait": round(1000 * seconds)}, {"press": "#finish"}, {"see": "Film 1"}, "filmed"]
         with made.step("film"):
             shown.look([{"press": "#film"}, {"see": "Put your face"}, {"press": "#record"}, *keep], of=NAME)

@@ -25,7 +25,7 @@ from mien.machine.terminal import tell
 from mien.machine.threads import thread_count
 from mien.studio.advice import advice_for
 from mien.studio.making import QUALITIES, Maker, Settings
-from mien.studio.people import MOST_CHUNK, FullError, NotThereError, OtherPlaceError, People
+from mien.studio.people import MOST_CHUNK, MOST_FACE, FullError, NotThereError, OtherPlaceError, People
 from mien.studio.taking import TAKINGS, place_of, take
 
 if TYPE_CHECKING:
@@ -160,7 +160,8 @@ class Studio:
             ("DELETE", f"{person}/making", does(maker.drop)), ("GET", f"{person}/growing", sends(maker.growing)),
             ("GET", f"{person}/fit", sends(lambda name: people.folder(name) / "tracking_preview.html")),
             ("POST", taken, does(self._prepare)), ("GET", taken, sends(self._taken)),
-            ("POST", f"{person}/phone", does(self._invite)), ("DELETE", f"{person}/phone", does(self._uninvite)),
+            ("POST", f"{person}/phone", does(self._invite)),
+            ("DELETE", f"{person}/phone", does(lambda name: phones and phones.end(name))),
         ]  # fmt: skip
         found = [Route(path, answered(answer), methods=[method]) for method, path, answer in routes]
         self.app = Starlette(routes=found, exception_handlers={Exception: _failed})
@@ -194,7 +195,7 @@ class Studio:
         self.maker.forget(name)
 
     async def _set_face(self, request: Request) -> Response:
-        content = await body_of(request, 1 << 20)
+        content = await body_of(request, MOST_FACE)
         await run_in_threadpool(self.people.write_face, request.path_params["name"], content)
         return JSONResponse({})
 
@@ -225,10 +226,6 @@ class Studio:
             raise UserError("phones cannot reach this studio; start it with `mien studio DIR --lan`")
         self.people.folder(name)
         return self.phones.invite(name)
-
-    def _uninvite(self, name: str) -> None:
-        if self.phones is not None:
-            self.phones.end(name)
 
     def _short(self, name: str) -> dict[str, Any]:
         """What the list shows of a person."""

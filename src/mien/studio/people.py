@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,12 @@ MOST_CHUNK = 8 << 20
 MOST_FILM = 4 << 30
 """Largest film, in bytes: two hours of a telephone."""
 _MOST_FILMS, _MOST_PEOPLE = 20, 1000
-_MOST_FACE = 512 << 10
+MOST_FACE = 512 << 10
 _ROOM_LEFT = 1 << 30
 """Bytes that films leave free on the disk, so that an avatar can still be made."""
 _PROBE_SECONDS = 120
+_COMES_SECONDS = 6.0
+"""How long no piece of a film may come, which recorders send every second, until it counts as left behind."""
 _NAME = re.compile(r"[^\W_](?:[\w .'-]{0,58}[\w'-])?")
 _FILM = re.compile(rf"film_(\d{{1,4}})\.(?:{'|'.join(ENDINGS)})")
 _PART = ".part"
@@ -56,7 +59,9 @@ class Film:
     name: str
     size: int
     whole: bool
-    """Whether it was finished. Otherwise the tab that sent it was closed, or still sends it."""
+    """Whether it was finished."""
+    coming: bool
+    """Whether it is not, and was added to in the last seconds. Otherwise the tab that sent it was closed."""
     facts: Mapping[str, Any]
     """Width and height in pixels, and seconds."""
 
@@ -118,7 +123,9 @@ class People:
         for path in folder.iterdir() if folder.is_dir() and not folder.is_symlink() else ():
             plain = path.name.removeprefix(".").removesuffix(_PART) if path.name.startswith(".") else path.name
             if _FILM.fullmatch(plain) and path.is_file() and not path.is_symlink():
-                found.append(Film(plain, path.stat().st_size, plain == path.name, facts.get(plain, {})))
+                stat, whole = path.stat(), plain == path.name
+                coming = not whole and time.time() - stat.st_mtime < _COMES_SECONDS
+                found.append(Film(plain, stat.st_size, whole, coming, facts.get(plain, {})))
         return sorted(found, key=lambda film: film.number)
 
     def film(self, name: str, film: str) -> Path:
@@ -170,12 +177,14 @@ class People:
     def finish_film(self, name: str, film: str) -> dict[str, Any]:
         """End a film that was begun, and return its facts. What is no film is removed, with the reason."""
         part = self._part_of(name, film)
+        facts = _probed(part)
         try:
-            facts = _probed(part)
-        except UserError:
-            part.unlink(missing_ok=True)
-            raise
-        part.replace(part.with_name(film))
+            if facts is None:
+                part.unlink(missing_ok=True)
+                raise UserError("this is no film that can be read; give one of a camera, such as .mp4 or .mov")
+            part.replace(part.with_name(film))
+        except OSError as error:
+            raise cannot_write(part, error) from None
         self.write(name, films={**self.read(name).get("films", {}), film: facts})
         return facts
 
@@ -189,8 +198,8 @@ class People:
 
     def write_face(self, name: str, picture: bytes) -> None:
         """Keep the picture that stands for a person, a JPEG."""
-        if not (picture.startswith(b"\xff\xd8\xff") and len(picture) <= _MOST_FACE):
-            raise UserError(f"the picture is no JPEG of at most {_MOST_FACE >> 10} kB; send another one")
+        if not picture.startswith(b"\xff\xd8\xff"):
+            raise UserError("the picture is no JPEG; send another one")
         write_atomically(self.folder(name) / "face.jpg", lambda aside: aside.write_bytes(picture))
 
     def remove(self, name: str) -> None:
@@ -214,11 +223,11 @@ def _part(folder: Path, film: str) -> Path:
     return folder / f".{film}{_PART}"
 
 
-def _probed(path: Path) -> dict[str, Any]:
-    """Facts about a film. Another process reads it, since a hostile file may end the process that decodes it."""
+def _probed(path: Path) -> dict[str, Any] | None:
+    """Facts about a film; None if it is none. A process reads it, since a hostile file may end what decodes it."""
     command = [sys.executable, "-m", "mien.studio.probe", str(path)]
-    try:
+    with suppress(subprocess.TimeoutExpired):
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False)
-        return json.loads(done.stdout)
-    except (subprocess.TimeoutExpired, ValueError):
-        raise UserError("this is no film that can be read; give one of a camera, such as .mp4 or .mov") from None
+        if done.returncode >= 0:
+            return json.loads(done.stdout) if done.returncode == 0 else None
+    raise UserError("the film could not be looked at; keep it again, or remove it")

@@ -88,8 +88,9 @@ class Phones:
 
     async def _begin(self, request: Request) -> Response:
         invited, ending = self._invitation(request), str((await json_of(request)).get("ending", ""))
-        if invited.film is not None:
-            await run_in_threadpool(self._forget_film, invited)  # the phone has lost its connection, and begins anew
+        if invited.film is not None:  # the phone has lost its connection, and begins anew
+            with suppress(NotThereError):
+                await run_in_threadpool(self.people.remove_film, invited.name, invited.film)
         invited.film = await run_in_threadpool(self.people.begin_film, invited.name, ending)
         return JSONResponse({})
 
@@ -107,12 +108,6 @@ class Phones:
         facts = await run_in_threadpool(self.people.finish_film, invited.name, invited.film)
         invited.done = True
         return JSONResponse(facts)
-
-    def _forget_film(self, invited: Invitation) -> None:
-        try:
-            self.people.remove_film(invited.name, invited.film or "")
-        except NotThereError:
-            invited.film = None
 
 
 def address_on_network() -> str:

@@ -28,6 +28,8 @@ export interface Film {
   name: string;
   size: number;
   whole: boolean;
+  /** Whether another page, or a phone, is sending it. */
+  coming: boolean;
   facts: { width?: number; height?: number; seconds?: number };
 }
 

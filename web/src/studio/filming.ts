@@ -40,6 +40,8 @@ export class Filming {
   private sending: Sending | null = null;
   private running = false;
   private box: number[] | null = null;
+  /** A picture for the list, which is kept with the film. */
+  private face: Blob | null = null;
 
   constructor(private readonly name: string, private readonly video: HTMLVideoElement) {}
 
@@ -79,7 +81,7 @@ export class Filming {
     const [type, ending] = FORMATS.find(([each]) => MediaRecorder.isTypeSupported(each)) ?? [];
     if (!type) throw new Error("This browser records no films. Choose a file, or open the studio in Chrome, Edge, Firefox or Safari.");
     [this.sending, this.film] = await Sending.begin(this.name, ending);
-    if (withFace && this.box) await ask("PUT", person(this.name, "face"), await portrait(this.video, this.box)).catch(() => {});
+    if (withFace && this.box) this.face = await portrait(this.video, this.box);
     const recorder = (this.recorder = new MediaRecorder(this.stream!, { mimeType: type, videoBitsPerSecond: BITS }));
     recorder.ondataavailable = ({ data }) => this.sending!.send(data).catch((error) => this.fail(error.message));
     this.guide = new Guide();
@@ -98,6 +100,7 @@ export class Filming {
     await this.sending!.send(new Blob());
     this.recorder = null;
     await (keeps ? ask("POST", person(this.name, "films", film), {}) : ask("DELETE", person(this.name, "films", film)));
+    if (keeps && this.face) await ask("PUT", person(this.name, "face"), this.face).catch(() => {});
     return keeps ? film : null;
   }
 

@@ -63,9 +63,10 @@ const sizeOf = (bytes: number) => (bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` 
 
 function filmRow(name: string, film: Film, number: number): HTMLElement {
   const { seconds, width, height } = film.facts, better = checked.get(film.name);
-  const about = film.whole ? [seconds && `${Math.round(seconds)} s`, width && `${width}×${height}`, sizeOf(film.size)].filter(Boolean).join(", ") : `unfinished, ${sizeOf(film.size)}`;
+  const about = film.whole ? [seconds && `${Math.round(seconds)} s`, width && `${width}×${height}`, sizeOf(film.size)].filter(Boolean).join(", ") : `${film.coming ? "is coming" : "unfinished"}, ${sizeOf(film.size)}`;
   const note = better && (better.length ? better.slice(0, 3).join(" ") : "It has all that an avatar needs.");
   const text = make("span", {}, `Film ${number}`, make("small", {}, about), ...(note ? [make("small", {}, note)] : []));
+  if (film.coming) return make("li", {}, text);
   const remove = press("Remove", () => removeFilm(name, film, number), `Remove film ${number}`);
   if (!film.whole) return make("li", {}, text, press("Keep", () => keep(name, film.name), `Keep film ${number}`), remove);
   const play = press("Play", () => ((chosen = film.name), showStage()), `Play film ${number}`);
@@ -315,7 +316,7 @@ function showPerson(): void {
   const rows = films.map((each, k) => ({ each, number: k + 1 })).filter(({ each }) => !sent.has(each.name));
   fill("films", [rows, [...checked]], () => rows.map(({ each, number }) => filmRow(name, each, number)));
   for (const id of ["film", "choose", "from-phone"]) button(id).disabled = filming !== null;
-  button("film").textContent = films.length ? "Film more" : "Film";
+  button("film").textContent = films.some((each) => each.whole) ? "Film more" : "Film";
   button("film").classList.toggle("main", !films.length);
   showMaking();
   showTakings();
