@@ -60,7 +60,8 @@ def person(name: str, *more: str) -> str:
 
 def give_film(people: People, name: str, film: Path) -> None:
     """Add a person who has a film."""
-    people.add(name)
+    if name not in people.names():
+        people.add(name)
     begun = people.begin_film(name, film.suffix[1:])
     people.append(name, begun, 0, film.read_bytes())
     people.finish_film(name, begun)

@@ -114,7 +114,6 @@ class People:
         path = self.root / name / _RECORD_FILE
         with _changing:
             known = self.read(name) if path.exists() else {}
-            known = {key: value for key, value in known.items() if key not in ("format", "version")}
             write_json(path, *RECORD, {**known, **changes})
 
     def films(self, name: str) -> list[Film]:
