@@ -139,13 +139,17 @@ def test_a_capture_by_litert_is_made_without_a_network(offline: Path, fork_serve
 
 
 def view_alone(avatar: str) -> None:
-    """Raise the loopback of a new network namespace, show an avatar, and print the viewer's page."""
+    """Show an avatar without a route to anywhere, and print the viewer's page."""
     assert leave_network()
+    raise_loopback()
+    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
+
+
+def raise_loopback() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         asked = struct.pack("16sH14x", b"lo", 0)
         _, flags = struct.unpack("16sH14x", fcntl.ioctl(any_socket, _FLAGS, asked))
         fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sH14x", b"lo", flags | _UP))
-    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
 
 
 ROOT = Path(__file__).parents[1]

@@ -2,6 +2,7 @@
 
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -9,7 +10,9 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -147,7 +150,75 @@ def test_a_full_disk_is_said_and_leaves_what_came_before(tmp_path: Path, monkeyp
     monkeypatch.setattr(people_on_disk.shutil, "disk_usage", lambda _: usage._replace(free=1 << 30))
     with pytest.raises(FullError, match="the disk is full; free 2 GB"):
         people.append("Ada", name, 6, b"more")
-    assert [(each.size, each.whole) for each in people.films("Ada")] == [(6, False)]
+    monkeypatch.undo()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8, hard))
+    try:
+        refuses("free disk space", people.append, "Ada", name, 6, b"more")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    (film,) = people.films("Ada")
+    assert (film.size, film.whole, film.coming) == (6, False, True)
+    os.utime(tmp_path / "Ada" / "films" / f".{name}.part", (1, 1))
+    assert not people.films("Ada")[0].coming
+
+
+def test_a_film_of_two_gigabytes_is_taken_and_one_of_five_is_not(tmp_path: Path, film: Path) -> None:
+    people = People(tmp_path)
+    people.add("Ada")
+    name, size = people.begin_film("Ada", "mp4"), 2 << 30
+    people.append("Ada", name, 0, film.read_bytes())
+    os.truncate(tmp_path / "Ada" / "films" / f".{name}.part", size)  # it takes no room on most disks
+    assert people.append("Ada", name, size, b"\0") == size + 1
+    assert people.finish_film("Ada", name)["width"] == 320
+    other = people.begin_film("Ada", "mp4")
+    refuses("is larger than 4 GB", people.append, "Ada", other, 4 << 30, b"more")
+
+
+STRANGE = (
+    "..", "%2e%2e", "../..", "..\\..", ".studio", "/etc/passwd", "Ada/../../x", "Ada\0", "A" * 4000,
+    "\N{FOX FACE}" * 80, "Ada\u202e", "-rf", "linked", "{workspace}", " ", "film_1.mp4/..", ".film_1.mp4.part", "film_1.exe",
+    "nobody",
+)  # fmt: skip
+BODIES = (b"", b"{", b"[" * 9000, b"\xff\xfe", b'{"name": 7}', b'{"out": "/"}', b" " * 20_000, b'["name"]', b"null")
+
+
+def test_two_hundred_hostile_requests_are_refused_and_change_nothing(serving: Serving, tmp_path: Path) -> None:
+    people, random, own = serving.maker.people, Random(7), person("Ada")
+    people.add("Ada")
+    people.append("Ada", people.begin_film("Ada", "mp4"), 0, b"begun")
+    (people.root / "linked").symlink_to(tmp_path)
+
+    def on_disk() -> dict[str, bytes]:
+        return {str(path): path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    before, token = on_disk(), serving.door.cookie
+    for number in range(200):
+        name = quote(random.choice(STRANGE), safe=random.choice(("", "/")))
+        film, method = f"{own}/films/film_1.mp4", random.choice(("GET", "PUT", "POST", "DELETE", "PATCH", "TRACE"))
+        path = random.choice(
+            (f"/api/people/{name}", f"{own}/films/{name}", f"{own}/take/{name}", f"/landmarker/{name}")
+        )
+        body, headers = random.choice(BODIES), {"Content_Type": "application/json"}
+        if number % 4 == 1:  # without the token
+            path, method = random.choice(("/", "/api/people", own, film)), random.choice(("GET", "POST", "DELETE"))
+            headers["Cookie"] = random.choice(("", token[:-1], f"{token}x", "mien_=", token.partition("=")[0] + "="))
+        elif number % 4 == 2:  # from a page of another site, or under another name
+            path, method = random.choice(("/", "/api/people", own, film)), random.choice(("GET", "POST", "DELETE"))
+            host = random.choice(
+                ("evil.example", f"127.0.0.1.evil.example:{serving.port}", f"127.0.0.1:{serving.port}")
+            )
+            headers |= {"Host": host, "Origin": random.choice(("null", "http://evil.example", "https://127.0.0.1"))}
+        elif number % 4 == 3:  # wrong pieces and words
+            at = random.choice(("", "-1", "1e9", "4", "6", "9" * 14, "5&at=0", "0x5"))
+            path, method = random.choice(
+                (("/api/people", "POST"), (f"{film}?at={at}", "PUT"), (f"{own}/films", "POST"))
+            )
+            body = body or b"more"
+        status = asked(serving, method, path, body, **headers)[0]
+        assert 400 <= status < 500 or status == 507, (status, method, path[:80], headers)
+    assert on_disk() == before
+    assert asked(serving, "GET", "/")[0] == 200
 
 
 def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) -> None:

@@ -1,5 +1,9 @@
 """The studio's page: its guide by rules, and in Chromium the way from the first page to the living avatar."""
 
+import errno
+import shutil
+import socket
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -10,12 +14,21 @@ import pytest
 
 pytest.importorskip("starlette")
 
+from forked import ForkServer
 from mien import runtime
+from mien.batch.plan import Options
 from mien.formats.page import write_page
+from mien.studio import server
 from mien.studio.people import People
-from studio_case import give_film, person, studio, told
+from mien.studio.server import Serving
+from needs import NO_NAMESPACE
+from refusals import refuses
+from studio_case import STUB, give_film, person, studio, told
+from test_end_to_end import leave_network, raise_loopback
 from test_web_webcam import ALLOWED, FAKE, found
-from web_case import WEB, browse, bundle, drawn_head, expect_usable, run_node, tasks_vision, until
+from web_case import WEB, browse, bundle, drawn_head, expect_usable, run_node, tasks_vision, until, violations
+
+HOUR = 3600.0
 
 GOOD = {"face": 0.5, "around": 0.5, "sharpness": 1.0}
 BOX = [0.35, 0.25, 0.65, 0.75]
@@ -104,9 +117,11 @@ def camera(tmp_path_factory: pytest.TempPathFactory, test_data: Path) -> list[st
 
 @pytest.mark.footage
 @pytest.mark.slow
-def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[str]) -> None:
+@pytest.mark.parametrize("program", [STUB, pytest.param(Options().program, marks=pytest.mark.long)])
+def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[str], program: Sequence[str]) -> None:
+    """A stand-in makes the avatar, or as a campaign `mien create`, with the preset draft."""
     root, head = tmp_path / "people", drawn_head(300)
-    with studio(root) as serving:
+    with studio(root, program) as serving:
         runtime.write_portable(root / ".studio" / "grown.mien", head)
         asked = {"size": (1000, 700), "flags": camera}
         first = [
@@ -120,16 +135,18 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
         second = [
             {"see": "Ada"}, {"press": "#people button"}, {"click": "Keep"}, {"see": "512×512"}, {"press": "#film"},
             {"see": "Put your face"}, {"press": "#record"}, {"see": " saved"}, {"press": "#finish"}, {"see": "Film 2"},
-            {"press": "#make"}, {"see": "Stop"},
+            {"click": "More"}, {"press": "#quality"}, {"keys": ["Home", "Enter"]}, {"press": "#make"}, {"see": "Stop"},
         ]  # fmt: skip
         made = browse(serving.address, steps=second, **asked)
         films = told(serving, "GET", person("Ada"))[1]["films"]
         assert [each["whole"] for each in films] == [True, True]
-        until(lambda: told(serving, "GET", person("Ada"))[1]["growing"] is not None)
+        until(lambda: told(serving, "GET", person("Ada"))[1]["growing"] is not None, HOUR)
         (root / ".studio" / "go").touch()
-        until(lambda: told(serving, "GET", person("Ada"))[1]["made"])
-        write_page(root / "Ada" / "me.html", head, None)
-        runtime.write_portable(root / "Ada" / "me.mien", head)
+        until(lambda: told(serving, "GET", person("Ada"))[1]["progress"]["state"] == "done", HOUR)
+        assert told(serving, "GET", person("Ada"))[1]["settings"]["quality"] == "draft"
+        if program == STUB:
+            write_page(root / "Ada" / "me.html", head, None)
+            runtime.write_portable(root / "Ada" / "me.mien", head)
         saved = [
             {"see": "Done"}, {"press": "#people button"}, {"press": '[aria-label="Save: Page"]'}, {"press": "#be-me"},
             {"see": "The avatar follows your face."}, {"press": "#be-me"}, {"see": "Be me"},
@@ -140,6 +157,98 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
             assert each["messages"] == []
             assert all(request.startswith((own, "blob:", "data:")) for request in each["requests"])
     assert (tmp_path / "Ada me.html").read_bytes() == (root / "Ada" / "me.html").read_bytes()
+
+
+def test_a_file_and_a_phone_send_films(tmp_path: Path, test_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The phone's page is on a phone's screen, and its film comes in three pieces while the studio waits for it."""
+    monkeypatch.setattr(server, "address_on_network", lambda: "127.0.0.2")
+    film, large = test_data / "cases" / "plain.mp4", tmp_path / "large.mp4"
+    large.write_bytes(film.read_bytes() + bytes(9 << 20))
+    with studio(tmp_path / "people", lan=True) as serving:
+        serving.maker.people.add("Ada")
+        given = [{"give": ["#file", film]}, {"see": "Turn your head further"}]
+        told_by_page = browse(serving.address, steps=given, fragment="Ada")
+        address = told(serving, "POST", person("Ada", "phone"), {})[1]["url"]
+        pieces: list[int] = []
+        append = serving.maker.people.append
+        monkeypatch.setattr(People, "append", lambda self, *more: pieces.append(len(more[-1])) or append(*more))
+        steps = [{"see": "Film yourself with this phone"}, {"give": ["#file", large]}, {"see": "The film has arrived"}]
+        told_by_phone = browse(address, steps=steps, size=(390, 844), device=("touch", "mobile"))
+        assert [each["messages"] for each in (told_by_page, told_by_phone)] == [[], []]
+        assert [request for request in told_by_phone["requests"] if not request.startswith((address, "data:"))] == []
+        assert [size >> 20 for size in pieces] == [4, 4, 1]
+        assert violations(told(serving, "POST", person("Ada", "phone"), {})[1]["url"], (390, 844), ("touch",)) == [[]]
+        films = told(serving, "GET", person("Ada"))[1]["films"]
+        assert [(each["whole"], each["facts"]["width"]) for each in films] == [(True, 320), (True, 320)]
+
+
+FILMS = """(async () => {
+  const one = (text) => document.querySelector(text), pause = () => new Promise((done) => setTimeout(done, 50));
+  const press = async (text) => {
+    while (one(text).disabled || one(text).hidden) await pause();
+    one(text).click();
+  };
+  while (one("#person").hidden) await pause();
+  await press("#film");
+  await press("#record");
+  BREAKS;
+  while (!one("#message").textContent) await pause();
+  return one("#message").textContent;
+})()"""
+SAVED = 'while (!one("#clock").textContent.includes("saved")) await pause();'
+FAULTS = {
+    "unplugged": (
+        f'{SAVED} one("#camera").srcObject.getVideoTracks()[0].dispatchEvent(new Event("ended"))',
+        "The camera was unplugged or switched off. What was filmed until then is kept.", True,
+    ),
+    "ended": (f"{SAVED} fetch = async () => {{ throw new TypeError() }}", "The studio does not answer.", False),
+    "full": ("", "The disk is full", False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_happens_while_filming_is_told_and_keeps_the_film(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    breaks, words, whole = FAULTS[fault]
+    with studio(tmp_path / "people") as serving:
+        serving.maker.people.add("Ada")
+        if fault == "full":
+            usage = shutil.disk_usage(tmp_path)
+            monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1 << 30))
+        (message,) = browse(serving.address, [FILMS.replace("BREAKS", breaks)], fragment="Ada", flags=[FAKE, ALLOWED])[
+            "results"
+        ]
+        assert words in message
+        (film,) = told(serving, "GET", person("Ada"))[1]["films"]
+        assert (film["whole"], film["size"] > 0) == (whole, fault != "full")
+
+
+def walk_offline(folder: str, film: str) -> None:
+    """Add a person, give a film and make an avatar of it, without a route to anywhere. It runs in a fork."""
+    if not leave_network():
+        return print("NO NAMESPACE")
+    raise_loopback()
+    with socket.socket() as outside:
+        assert outside.connect_ex(("192.0.2.1", 80)) == errno.ENETUNREACH
+    refuses("this machine is on no network", Serving, Path(folder), lan=True)
+    with studio(Path(folder)) as serving:
+        serving.maker.people.add("Ada")
+        steps = [{"give": ["#file", film]}, {"see": "Turn your head further"}, {"press": "#make"}, {"see": "Stop"}]
+        told_by_page = browse(serving.address, steps=steps, fragment="Ada")
+        own = (f"http://127.0.0.1:{serving.port}/", "blob:", "data:")
+        assert [each for each in told_by_page["requests"] if not each.startswith(own)] == []
+        assert told_by_page["messages"] == []
+    return print("DONE")
+
+
+def test_nothing_needs_a_network(tmp_path: Path, test_data: Path, fork_server: ForkServer) -> None:
+    film = test_data / "cases" / "plain.mp4"
+    process = fork_server.call("test_studio_page:walk_offline", str(tmp_path / "people"), str(film))
+    assert process.wait() == 0, process.stderr[-2000:]
+    if "NO NAMESPACE" in process.stdout:
+        pytest.skip(NO_NAMESPACE)
+    assert "DONE" in process.stdout
 
 
 def test_the_page_can_be_used_by_everybody(tmp_path: Path, test_data: Path) -> None:

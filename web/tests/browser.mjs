@@ -5,7 +5,7 @@
 //   "scripts": [..], "screenshots": [path or null, ..], "whole": true for screenshots of the whole page and not of the window
 //   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"press": selector},
 //     {"keys": names}, {"drag": [x, y]},
-//     {"fill": [label, text]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
+//     {"fill": [label, text]}, {"give": [selector of an input, path]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
 //     {"settled": path}: a screenshot that differs from the last one and stays as it is
 //   "webgpu": true for WebGPU in software, "flags": further options of Chromium, "downloads": folder, "opening": a script
 //   that runs before those of the page, "lively": true for a page that may move by itself, "dark", "touch", "mobile",
@@ -73,6 +73,7 @@ function actions(tab, width, height, shapes) {
       for (const name of names) await tab.keyboard.press(name);
     },
     fill: ([label, text]) => tab.locator(`xpath=//*[text()="${label}"]/following::input[1]`).fill(text),
+    give: ([selector, path]) => tab.locator(selector).setInputFiles(path),
     screenshot: (path) => tab.screenshot({ path }),
     reload: () => tab.reload(),
     async settled(path) {

@@ -159,13 +159,14 @@ class People:
         if shutil.disk_usage(self.root).free < _ROOM_LEFT + len(piece):
             raise FullError(f"{self.root}: the disk is full; free {(_ROOM_LEFT >> 30) + 1} GB and try again")
         try:
-            with _changing, part.open("r+b") as file:
+            with _changing, part.open("r+b", buffering=0) as file:
                 size = file.seek(0, 2)
                 if size != at:
                     raise OtherPlaceError(f"{film}: has {size} bytes, and the piece begins at {at}")
                 try:
-                    file.write(piece)
-                    file.flush()
+                    rest = memoryview(piece)
+                    while rest:
+                        rest = rest[file.write(rest) :]
                 except OSError:
                     file.truncate(size)  # a part of the piece
                     raise

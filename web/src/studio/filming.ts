@@ -39,7 +39,7 @@ export class Filming {
   film = "";
   private sending: Sending | null = null;
   private running = false;
-  private box: number[] | null = null;
+  private wantsFace = false;
   /** A picture for the list, which is kept with the film. */
   private face: Blob | null = null;
 
@@ -63,7 +63,10 @@ export class Filming {
     this.running = true;
     detector.onFound = (found) => {
       if (!this.running) return;
-      this.box = found.box ?? null;
+      if (this.recording && this.wantsFace && found.box) {
+        this.wantsFace = false;
+        void portrait(this.video, found.box).then((face) => (this.face = face));
+      }
       this.guide.see(found, found.box ? lightOf(this.video, found.box) : null);
       this.onSeen();
     };
@@ -81,7 +84,7 @@ export class Filming {
     const [type, ending] = FORMATS.find(([each]) => MediaRecorder.isTypeSupported(each)) ?? [];
     if (!type) throw new Error("This browser records no films. Choose a file, or open the studio in Chrome, Edge, Firefox or Safari.");
     [this.sending, this.film] = await Sending.begin(this.name, ending);
-    if (withFace && this.box) this.face = await portrait(this.video, this.box);
+    this.wantsFace = withFace;
     const recorder = (this.recorder = new MediaRecorder(this.stream!, { mimeType: type, videoBitsPerSecond: BITS }));
     recorder.ondataavailable = ({ data }) => this.sending!.send(data).catch((error) => this.fail(error.message));
     this.guide = new Guide();
