@@ -11,7 +11,7 @@ from mien.capture.settings import CaptureSettings
 from mien.commands.train_options import Elsewhere, TrainOptions
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.pipeline.names import check_growing, check_sources, check_viewer, run_name, sequence_names
+from mien.pipeline.names import check_sources, check_viewer, run_name, sequence_names
 from mien.tracking.settings import (
     PaperSettings,
     PhotometricSettings,
@@ -87,7 +87,9 @@ class Command:
         if self.view:
             check_viewer()
         if self.growing is not None:
-            check_growing(self.growing)
+            from mien.disk.files import check_writable  # imports numpy
+
+            check_writable(self.growing)
         if needs := SPLITS[split := self.options.settings().split].needs:
             raise UserError(
                 f"--split {split}: needs {needs}, and this command makes one sequence; use `mien capture` for each or "

@@ -159,15 +159,6 @@ def check_studio() -> None:
         raise UserError("the studio's server needs packages that are missing; run `pip install 'mien[studio,create]'`")
 
 
-def check_growing(path: Path) -> None:
-    """Check that the avatar of a training can be written to a file."""
-    from mien.disk.files import check_writable  # imports numpy
-
-    if path.suffix.lower() != ".mien":
-        raise UserError(f"--growing {path}: does not end in .mien; give such a file")
-    check_writable(path)
-
-
 def check_driver(
     by: Path, sequence: str | None = None, fps: float | None = None, capture: CaptureSettings | None = None
 ) -> Kind:
