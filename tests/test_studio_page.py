@@ -133,7 +133,7 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
         (unfinished,) = told(serving, "GET", person("Ada"))[1]["films"]
         assert (unfinished["whole"], unfinished["size"] > 10_000) == (False, True), "the tab was closed"
         second = [
-            {"see": "Ada"}, {"press": "#people button"}, {"click": "Keep"}, {"see": "512×512"}, {"press": "#film"},
+            {"see": "Ada"}, {"press": "#people button"}, {"press": '[aria-label="Keep film 1"]'}, {"see": "512×512"}, {"press": "#film"},
             {"see": "Put your face"}, {"press": "#record"}, {"see": " saved"}, {"press": "#finish"}, {"see": "Film 2"},
             {"click": "More"}, {"press": "#quality"}, {"keys": ["Home", "Enter"]}, {"press": "#make"}, {"see": "Stop"},
         ]  # fmt: skip
@@ -193,7 +193,9 @@ FILMS = """(async () => {
   await press("#record");
   BREAKS;
   while (!one("#message").textContent) await pause();
-  return one("#message").textContent;
+  const words = one("#message").textContent;
+  AFTER;
+  return words;
 })()"""
 SAVED = 'while (!one("#clock").textContent.includes("saved")) await pause();'
 FAULTS = {
@@ -202,7 +204,7 @@ FAULTS = {
         "The camera was unplugged or switched off. What was filmed until then is kept.", True,
     ),
     "ended": (f"{SAVED} fetch = async () => {{ throw new TypeError() }}", "The studio does not answer.", False),
-    "full": ("", "The disk is full", False),
+    "full": ("", "the disk is full; free 2 GB and try again.", False),
 }  # fmt: skip
 
 
@@ -216,9 +218,9 @@ def test_what_happens_while_filming_is_told_and_keeps_the_film(
         if fault == "full":
             usage = shutil.disk_usage(tmp_path)
             monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1 << 30))
-        (message,) = browse(serving.address, [FILMS.replace("BREAKS", breaks)], fragment="Ada", flags=[FAKE, ALLOWED])[
-            "results"
-        ]
+        after = """while (!one('[aria-label="Play film 1"]')) await pause()""" if whole else ""
+        steps = [FILMS.replace("BREAKS", breaks).replace("AFTER", after)]
+        (message,) = browse(serving.address, steps, fragment="Ada", flags=[FAKE, ALLOWED])["results"]
         assert words in message
         (film,) = told(serving, "GET", person("Ada"))[1]["films"]
         assert (film["whole"], film["size"] > 0) == (whole, fault != "full")

@@ -20,8 +20,7 @@ class Command:
     port: Annotated[int, PORT] = 0
     """Port of the page. 0 means a free one."""
     lan: bool = False
-    """Let phones of the local network send films: the page shows a QR code for that. Nothing else of the studio is
-    reached from there."""
+    """Let phones of the local network send films, and reach nothing else: the page shows a QR code for that."""
     browser: bool = True
     """Open the page in the browser of this machine."""
 

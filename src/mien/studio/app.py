@@ -159,8 +159,8 @@ class Studio:
             ("POST", f"{person}/making", does(self._make, reads=True)),
             ("DELETE", f"{person}/making", does(maker.drop)), ("GET", f"{person}/growing", sends(maker.growing)),
             ("GET", f"{person}/fit", sends(lambda name: people.folder(name) / "tracking_preview.html")),
-            ("POST", taken, does(self._prepare)), ("GET", taken, sends(self._taken)),
-            ("POST", f"{person}/phone", does(self._invite)),
+            ("POST", taken, does(lambda name, kind: self._taken(name, kind, take) and None)),
+            ("GET", taken, sends(self._taken)), ("POST", f"{person}/phone", does(self._invite)),
             ("DELETE", f"{person}/phone", does(lambda name: phones and phones.end(name))),
         ]  # fmt: skip
         found = [Route(path, answered(answer), methods=[method]) for method, path, answer in routes]
@@ -207,10 +207,6 @@ class Studio:
 
     def _make(self, name: str, content: Mapping[str, Any]) -> None:
         self.maker.add(name, Settings.of(content))
-
-    def _prepare(self, name: str, kind: str) -> None:
-        """Have a file written that is taken away."""
-        self._taken(name, kind, take)
 
     def _taken(self, name: str, kind: str, of: Callable[..., Path | None] = place_of) -> Path:
         """A file that is taken away: for a frame of the page, or to be saved."""

@@ -76,11 +76,14 @@ class Progress:
 class _Pace:
     """How fast the work of an attempt goes."""
 
-    def __init__(self, quality: str, usual: float | None) -> None:
-        """Begin an attempt. `usual` is how long the whole work took on this machine; None if nothing was made yet."""
+    def __init__(self, quality: str, usual: float | None, began: tuple[float, float] | None) -> None:
+        """Begin an attempt. `usual` is how long the whole work took on this machine; None if nothing was made yet.
+
+        `began` is when it began, and how much was done by then, 0 to 1; None if the first look has to tell that.
+        """
         self._usual = usual
         self._shares = {**_SHARES, "training": _TRAININGS.get(quality, _SHARES["training"])}
-        self._began: tuple[float, float] | None = None
+        self._began = began
         self._done = 0.0
 
     def seconds_left(self, stage: Stage | None, now: float) -> int | None:
@@ -219,7 +222,8 @@ class Maker:
         settings = Settings.of(self.people.read(row.name).get("settings", {}))
         self.growing(row.name).parent.mkdir(exist_ok=True)
         self.growing(row.name).unlink(missing_ok=True)
-        self._pace = _Pace(settings.quality, self._usual(settings.quality))
+        began = None if self._printed else (time.monotonic(), 0.0)  # an earlier attempt has done a part
+        self._pace = _Pace(settings.quality, self._usual(settings.quality), began)
         state = attempt(self.batch.root, self._program, settings.threads or None, row)
         if self._ended or not self._is_next(row):
             return  # stopped by the end of the studio, or by a person
