@@ -135,8 +135,8 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
         second = [
             {"see": "Ada"}, {"press": "#people button"}, {"press": '[aria-label="Keep film 1"]'}, {"see": "512×512"},
             {"press": "#film"}, {"see": "Put your face"}, {"press": "#record"}, {"see": " saved"}, {"press": "#finish"},
-            {"see": "Film 2"}, {"click": "More"}, {"press": "#quality"}, {"keys": ["Home", "Enter"]}, {"press": "#make"},
-            {"see": "Stop"},
+            {"see": "Film 2"}, {"click": "More"}, {"press": "#quality"}, {"keys": ["Home", "Enter"]},
+            {"press": "#make"}, {"see": "Stop"},
         ]  # fmt: skip
         made = browse(serving.address, steps=second, **asked)
         films = told(serving, "GET", person("Ada"))[1]["films"]
