@@ -178,7 +178,7 @@ def test_a_file_and_a_phone_send_films(tmp_path: Path, test_data: Path, monkeypa
         assert [each["messages"] for each in (told_by_page, told_by_phone)] == [[], []]
         assert [request for request in told_by_phone["requests"] if not request.startswith((address, "data:"))] == []
         assert [size >> 20 for size in pieces] == [4, 4, 1]
-        assert violations(told(serving, "POST", person("Ada", "phone"), {})[1]["url"], (390, 844), ("touch",)) == [[]]
+        assert violations(told(serving, "POST", person("Ada", "phone"), {})[1]["url"], (390, 844), ("touch",)) == []
         films = told(serving, "GET", person("Ada"))[1]["films"]
         assert [(each["whole"], each["facts"]["width"]) for each in films] == [(True, 320), (True, 320)]
 
