@@ -1,4 +1,4 @@
-# make setup | web-packages | chromium | web | demo | test | test-long | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | chromium | web | demo | studio | test | test-long | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
+.PHONY: setup landmarker web-packages chromium web build demo studio test test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -70,6 +70,9 @@ web: web/node_modules/.installed
 
 demo: setup
 	$(BIN)/mien demo --out out/demo
+
+studio: setup
+	$(BIN)/mien studio out/people
 
 # Everything that a change can break: one process a core, each with one thread (tests/conftest.py says how many).
 test: setup web-packages chromium

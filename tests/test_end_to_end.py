@@ -91,7 +91,7 @@ OF_A_RUN = {
     "export-dataset": "{toy} --out {out}/data --format insta", "import": "{exported} --out {out}/imported",
     "face-models": "--json", "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
 }  # fmt: skip
-"""Lines of every command but two: `demo` makes the subject, and `view` has a test of its own."""
+"""Lines of every command but three: `demo` makes the subject, and `studio` and `view` have tests of their own."""
 _FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
 
 
@@ -111,7 +111,7 @@ def run_all(server: ForkServer, lines: dict[str, str], **given: object) -> None:
 
 
 def test_no_command_needs_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "view"} == set(COMMANDS)
+    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "studio", "view"} == set(COMMANDS)
     video = offline / VIDEO
     (tmp_path / "table.csv").write_text(f"video\n{video}\n")
     table, stub = tmp_path / "table.csv", " ".join(PROGRAM)
@@ -139,13 +139,17 @@ def test_a_capture_by_litert_is_made_without_a_network(offline: Path, fork_serve
 
 
 def view_alone(avatar: str) -> None:
-    """Raise the loopback of a new network namespace, show an avatar, and print the viewer's page."""
+    """Show an avatar without a route to anywhere, and print the viewer's page."""
     assert leave_network()
+    raise_loopback()
+    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
+
+
+def raise_loopback() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         asked = struct.pack("16sH14x", b"lo", 0)
         _, flags = struct.unpack("16sH14x", fcntl.ioctl(any_socket, _FLAGS, asked))
         fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sH14x", b"lo", flags | _UP))
-    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
 
 
 ROOT = Path(__file__).parents[1]

@@ -168,8 +168,8 @@ def browse(
     return ask_node(page=address, **told)
 
 
-def until(done: Callable[[], bool]) -> None:
-    ends = time.monotonic() + PATIENCE_SECONDS
+def until(done: Callable[[], bool], seconds: float = PATIENCE_SECONDS) -> None:
+    ends = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < ends, "it never came"
         time.sleep(0.01)

@@ -1,5 +1,5 @@
 // Builds dist/ (the package), and src/mien/formats/shared/page.html, webgpu.js, webcam.html and microphone.html (the page that
-// `mien export` fills, and what --webgpu, --webcam and --microphone put into it; they are committed, so that the Python package needs no node). `node build.mjs FOLDER` writes all into FOLDER instead.
+// `mien export` fills, and what --webgpu, --webcam and --microphone put into it), and the pages of src/mien/studio. They are committed, so that the Python package needs no node. `node build.mjs FOLDER` writes all into FOLDER instead.
 import { build, transform } from "esbuild";
 import { mkdir, readFile, writeFile } from "node:fs/promises";
 import { dirname, join } from "node:path";
@@ -43,9 +43,10 @@ const write = async (path, text) => {
 const script = await bundle("src/page.ts", "iife");
 if (script.includes("</script")) throw new Error("the script would end its own element");
 const detector = { DETECTOR: JSON.stringify(await bundle("src/webcam_detector.ts", "iife")) };
+const studio = { studio: await bundle("src/studio/studio.ts", "iife", detector), phone: await bundle("src/studio/phone.ts", "iife") };
 const camera = await bundle("src/webcam_page.ts", "iife", detector);
 const voice = await bundle("src/microphone_page.ts", "iife");
-if (`${camera}${voice}`.includes("</script")) throw new Error("a script would end its own element");
+if (`${camera}${voice}${studio.studio}${studio.phone}`.includes("</script")) throw new Error("a script would end its own element");
 /** A page's html without blanks between its lines, and with small styles. */
 const smaller = async (name) => {
   const [, before, style, after] = /^(.*<style>)(.*)(<\/style>.*)$/s.exec(await readFile(join(here, "src", name), "utf8"));
@@ -55,9 +56,10 @@ const smaller = async (name) => {
 const template = await smaller("page.html");
 for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"], ["webcam.js", "src/webcam.ts"]])
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
-const page = (name, text, own = name) => write(folder ? join(folder, own) : join(here, "../src/mien/formats/shared", name), text);
+const page = (name, text, own = name, room = "formats/shared") => write(folder ? join(folder, own) : join(here, "../src/mien", room, name), text);
 await page("page.html", template.replace("{{script}}", () => script));
 await page("microphone.html", (await smaller("microphone_page.html")).replace("{{script}}", () => voice));
 await page("webcam.html", (await smaller("webcam_page.html")).replace("{{script}}", () => camera));
+for (const [name, code] of Object.entries(studio)) await page(`${name}.html`, (await smaller(`studio/${name}.html`)).replace("{{script}}", () => code), undefined, "studio");
 const gpu = await build({ ...options, plugins: [shaders], entryPoints: ["src/webgpu.ts"], format: "iife", globalName: "mienWebGpu" });
 await page("webgpu.js", gpu.outputFiles[0].text, "webgpu_page.js");

@@ -25,6 +25,7 @@ from mien.plugins import missing_package
 GROUPS = {
     "Make an avatar": {
         "demo": "the whole path on a synthetic head, in minutes: start here",
+        "studio": "film yourself in a browser, watch the avatar grow, take it away",
         "create": "video -> avatar, page, film and report: all stages in one command",
         "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
         "track": "capture -> face parameters, cameras, overlay video",

@@ -3,8 +3,9 @@
 // prints json: results of the scripts, requests of the page, its messages, and the ratio of the canvas at each saving.
 // server.mjs does the same for many pages in one browser. What can be asked for:
 //   "scripts": [..], "screenshots": [path or null, ..], "whole": true for screenshots of the whole page and not of the window
-//   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"drag": [x, y]},
-//     {"fill": [label, text]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
+//   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"press": selector},
+//     {"keys": names}, {"drag": [x, y]},
+//     {"fill": [label, text]}, {"give": [selector of an input, path]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
 //     {"settled": path}: a screenshot that differs from the last one and stays as it is
 //   "webgpu": true for WebGPU in software, "flags": further options of Chromium, "downloads": folder, "opening": a script
 //   that runs before those of the page, "lively": true for a page that may move by itself, "dark", "touch", "mobile",
@@ -67,7 +68,12 @@ function actions(tab, width, height, shapes) {
     wait: (milliseconds) => tab.waitForTimeout(milliseconds),
     see: (text) => tab.getByText(text).first().waitFor(),
     click: (text) => tab.getByText(text, { exact: true }).first().click(),
+    press: (selector) => tab.locator(selector).click(),
+    async keys(names) {
+      for (const name of names) await tab.keyboard.press(name);
+    },
     fill: ([label, text]) => tab.locator(`xpath=//*[text()="${label}"]/following::input[1]`).fill(text),
+    give: ([selector, path]) => tab.locator(selector).setInputFiles(path),
     screenshot: (path) => tab.screenshot({ path }),
     reload: () => tab.reload(),
     async settled(path) {

@@ -73,6 +73,8 @@ class Command:
     """Frames in overlay.mp4: all, every n-th, at most 120 (auto), or none."""
     view: bool = False
     """Show the avatar in a browser while it trains."""
+    growing: Path | None = None
+    """A .mien file to write the avatar to from time to time while it trains. `mien view FILE --follow` shows it."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions.of)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: _Tracking = field(default_factory=_Tracking)
@@ -84,6 +86,10 @@ class Command:
         self.options.check()
         if self.view:
             check_viewer()
+        if self.growing is not None:
+            from mien.disk.files import check_writable  # imports numpy
+
+            check_writable(self.growing)
         if needs := SPLITS[split := self.options.settings().split].needs:
             raise UserError(
                 f"--split {split}: needs {needs}, and this command makes one sequence; use `mien capture` for each or "
@@ -140,7 +146,7 @@ class Command:
             show_trackings(workspace, list(trackings), self.overlay)
             begin("training")
             published = PRESETS[self.options.preset].published
-            run_training_stage(workspace, names, run, method, settings, self.view, published)
+            run_training_stage(workspace, names, run, method, settings, self.view, published, self.growing)
             show_page(workspace, run)
             if settings.holds_out:
                 begin("scoring")
