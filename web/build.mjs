@@ -10,7 +10,7 @@ import { minify } from "terser";
 const here = dirname(fileURLToPath(import.meta.url));
 const folder = process.argv[2];
 const presets = JSON.stringify(JSON.parse(await readFile(join(here, "../src/mien/runtime/presets.json"), "utf8")));
-const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here, external: ["./webgpu.js", "three", "three/*"] };
+const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here, external: ["./webgpu.js", "three", "three/*", "@sparkjsdev/spark", "playcanvas", "@babylonjs/core/*"] };
 /** A number of a shader with no more digits than a float has. */
 const shorter = (number) => {
   const exact = Math.fround(number);
@@ -60,7 +60,7 @@ const smaller = async (name) => {
 const template = await smaller("page.html");
 for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"], ["webcam.js", "src/webcam.ts"]])
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
-for (const name of ["gaussians", "three"])
+for (const name of ["gaussians", "three", "spark", "playcanvas", "babylon"])
   await write(folder ? join(folder, `${name}.js`) : join(here, "dist", `${name}.js`), (await bundle(`src/${name}.ts`, "esm", {}, [apart])) + "\n");
 const page = (name, text, own = name) => write(folder ? join(folder, own) : join(here, "../src/mien/formats/shared", name), text);
 await page("page.html", template.replace("{{script}}", () => script));

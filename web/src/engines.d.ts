@@ -1,5 +1,10 @@
 // What the adapters use of three.js, which has no types of its own. With @types/three, a project sees the real ones.
 declare module "three" {
+  export class DataTexture {
+    [name: string]: any;
+    constructor(...given: any[]);
+  }
+  export const FloatType: any, RGBAFormat: any;
   export class Object3D {
     [name: string]: any;
   }
