@@ -80,7 +80,8 @@ def build(folder: Path) -> Path:
 
 def bundle(source: Path, out: Path, *options: str) -> None:
     command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(source), "--bundle"]
-    subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True)
+    packages = os.environ | {"NODE_PATH": str(WEB / "node_modules")}  # for what lies elsewhere, such as a fresh build
+    subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True, env=packages)
 
 
 class _Server:

@@ -5,6 +5,7 @@ import { StandardMaterial } from "@babylonjs/core/Materials/standardMaterial.js"
 import { Color3, Color4 } from "@babylonjs/core/Maths/math.color.js";
 import { Vector3 } from "@babylonjs/core/Maths/math.vector.js";
 import { CreateBox } from "@babylonjs/core/Meshes/Builders/boxBuilder.js";
+import { TransformNode } from "@babylonjs/core/Meshes/transformNode.js";
 import { Scene } from "@babylonjs/core/scene.js";
 import { Stage } from "mien-web/babylon";
 
@@ -21,12 +22,20 @@ export async function open(canvas, background) {
       made.node.position.set(...place);
       return made;
     },
+    hide(made, hidden) {
+      made.node.setEnabled(!hidden);
+    },
+    hang(made, place) {
+      const parent = new TransformNode("parent", scene);
+      parent.position.set(...place);
+      made.node.parent = parent;
+    },
     box(place, size, color) {
       const made = CreateBox("box", { size }, scene), material = (made.material = new StandardMaterial("box", scene));
       material.disableLighting = true;
       material.emissiveColor = new Color3(...color);
       made.position.set(...place);
-      return { remove: () => made.dispose(), move: (...to) => made.position.set(...to) };
+      return { remove: () => made.dispose() };
     },
     look(eye, target, fov) {
       camera.fov = (fov * Math.PI) / 180;

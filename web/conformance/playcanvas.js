@@ -23,6 +23,15 @@ export async function open(canvas, background) {
       made.node.setPosition(...place);
       return made;
     },
+    hide(made, hidden) {
+      made.node.enabled = !hidden;
+    },
+    hang(made, place) {
+      const parent = new pc.Entity("parent");
+      parent.setPosition(...place);
+      app.root.addChild(parent);
+      made.node.reparent(parent);
+    },
     box(place, size, color) {
       const material = new pc.StandardMaterial(), made = new pc.Entity("box");
       Object.assign(material, { useLighting: false, emissive: new pc.Color(...color) });
@@ -31,7 +40,7 @@ export async function open(canvas, background) {
       made.setLocalScale(size, size, size);
       made.setPosition(...place);
       app.root.addChild(made);
-      return { remove: () => made.destroy(), move: (...to) => made.setPosition(...to) };
+      return { remove: () => made.destroy() };
     },
     look(eye, target, fov) {
       camera.camera.fov = fov;

@@ -18,11 +18,20 @@ export async function open(canvas, background) {
       made.node.position.set(x, y, z);
       return made;
     },
+    hide(made, hidden) {
+      made.node.visible = !hidden;
+    },
+    hang(made, place) {
+      const parent = new THREE.Group();
+      parent.position.set(...place);
+      scene.add(parent);
+      parent.add(made.node);
+    },
     box([x, y, z], size, color) {
       const made = new THREE.Mesh(new THREE.BoxGeometry(size, size, size), new THREE.MeshBasicMaterial({ color: shown(color) }));
       made.position.set(x, y, z);
       scene.add(made);
-      return { remove: () => made.removeFromParent(), move: (...place) => made.position.set(...place) };
+      return { remove: () => made.removeFromParent() };
     },
     look(eye, target, fov) {
       camera.fov = fov;
