@@ -1,6 +1,8 @@
 """Avatars in scenes of three.js, Spark, PlayCanvas and Babylon.js, and the arrays of Gaussians that they get."""
 
 import gzip
+import json
+import re
 import shutil
 import subprocess
 import sys
@@ -12,11 +14,15 @@ import torch
 
 import web_case as web
 from mien import runtime
+from mien.formats.glb import write_glb
+from mien.formats.page import write_packed
 from mien.rotation import matrix_from_axis_angle, matrix_from_quaternion
+from test_glb import mesh_model
 from test_web import points
 from web_case import WEB, drawn_head, faces_of, package
 
 ENGINES = {"three": "three", "spark": "@sparkjsdev/spark", "playcanvas": "playcanvas", "babylon": "@babylonjs/core"}
+SPEC = WEB.parent / "docs" / "spec"
 TURN = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], np.float32)
 """A rotation of the object that no axis shares."""
 PLACE, SIZE, EYE = np.array([0.1, -0.2, 0.3], np.float32), np.float32(1.5), (0.3, 0.2, 1.0)
@@ -109,16 +115,114 @@ def bundled(built: Path, source: Path, out: Path) -> None:
     web.bundle(source, out, f"--alias:mien-web={built / 'mien.js'}", *aliases)
 
 
-END = "while (!window.rows && !window.failed) await new Promise((done) => setTimeout(done, 100)); return window.rows ?? window.failed;"
+END = """
+while (!window.rows && !window.failed) await new Promise((done) => setTimeout(done, 100));
+return window.rows ?? window.failed;
+"""
 
 
 @pytest.mark.unchecked
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_conformance_page_passes(site: Path, engine: str) -> None:
-    """Faces, a box before and behind the head, two avatars, and what objects of a scene do: as in mien's own renderer."""
+    """Faces, a box before and behind the head, two avatars, and what an object of a scene does."""
     with web.served(site) as address:
         told = web.browse(f"{address}/index.html?engine={engine}", [web.script(END)], size=(400, 600))
     (rows,) = told["results"]
     assert isinstance(rows, list), rows
     assert len(rows) == 2 * 2 + 2 + 1 + 5
     assert [row for row in rows if not row["passed"]] == []
+
+
+def test_the_lines_of_the_docs_show_an_avatar(built: Path, site: Path) -> None:
+    """The five lines of each engine run in a scene of the conformance page."""
+    blocks = re.findall(r"```js\n(const stage.*?)```", (WEB.parent / "docs" / "web.md").read_text(), re.DOTALL)
+    assert [block.count("\n") for block in blocks] == [5] * 4
+    write_packed(site / "few.packed", drawn_head(300))
+    folder = WEB / "conformance"
+    shown = """
+      const {{ open }} = await import("./five/{engine}.js"), canvas = document.querySelector("canvas");
+      canvas.width = canvas.height = 100;
+      const host = await open(canvas, [1, 1, 1]);
+      host.look([0, 1.6, 0.9], [0, 1.6, 0], 25);
+      const ada = await host.five(new Uint8Array(await (await fetch("few.packed")).arrayBuffer()));
+      for (let i = 0; i < 6; ++i) await new Promise(requestAnimationFrame);
+      return [await host.draw(), ada.face.expression.some((x, k) => x !== ada.avatar.neutral.expression[k])];
+    """
+    steps = []
+    for engine, block in zip(ENGINES, blocks, strict=True):
+        source = (folder / f"{engine}.js").read_text()
+        five = f"  return {{\n    async five(file) {{\n{block}\n      return ada;\n    }},\n"
+        text = 'import { readAny } from "mien-web";\n' + source.replace("  return {\n", five, 1)
+        (site / f"{engine}.five.js").write_text(text)
+        bundled(built, site / f"{engine}.five.js", site / "five" / f"{engine}.js")
+        steps.append(web.script(shown.format(engine=engine)))
+    with web.served(site) as address:
+        told = [web.browse(f"{address}/index.html", [step], size=(300, 300)) for step in steps]
+    for engine, one in zip(ENGINES, told, strict=True):
+        ((picture, smiles),) = one["results"]
+        assert smiles, engine
+        assert (web.picture(picture)[..., :3].std(-1) > 0.02).mean() > 0.1, f"{engine}: colours are seen"
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_room_of_each_engine_runs(built: Path, site: Path, engine: str) -> None:
+    folder = site / f"room_{engine}"
+    folder.mkdir()
+    example = WEB / "examples" / engine
+    bundled(built, example / "main.js", folder / "main.bundle.js")
+    shutil.copy(example / "index.html", folder)
+    write_packed(folder / "me.packed", drawn_head(300))
+    wait = """
+      while (!window.made) await new Promise((done) => setTimeout(done, 50));
+      const { left, right, cube, stage } = made;
+      left.setFace({ smile: 1 });
+      for (let i = 0; i < 5; ++i) await new Promise(requestAnimationFrame);
+      return [stage.avatars.length, left.changed, document.querySelectorAll("canvas").length];
+    """
+    with web.served(folder) as address:
+        told = web.browse(address, [web.script(wait)], size=(240, 160))
+    assert told["results"] == [[2, False, 1]]
+    assert [message for message in told["messages"] if "rror" in message] == []
+
+
+def test_the_reference_of_the_spec_poses_as_python(tmp_path: Path) -> None:
+    """Centres, covariances, colours and opacities of a .glb, by 141 lines that share no code with the package."""
+    portable = drawn_head(200, 5, columns=2, features=16)
+    write_glb(tmp_path / "a.glb", portable, mesh_model(portable), 64)
+    (face,) = faces_of(portable, 1)
+    told = web.run_node("reference.mjs", SPEC / "reference.mjs", tmp_path / "a.glb", web.as_json([face])[0])
+    posed = runtime.pose(portable.baked, face)
+    R = matrices(posed.quats)
+    expected = np.einsum("nij,nj,nkj->nik", R, posed.scales**2, R).reshape(-1, 9)
+    centres, covariances, colors, opacities = (np.array(part) for part in told["gaussians"])
+    np.testing.assert_allclose(centres, posed.means, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(covariances, expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(colors, (0.5 + 0.28209479177387814 * posed.sh[:, 0]).clip(0), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(opacities, posed.opacities, rtol=0, atol=1e-4)
+    assert (SPEC / "reference.mjs").read_text().count("\n") <= 150
+    schema = json.loads((SPEC / "EXT_gaussian_avatar.schema.json").read_text())
+    assert faults(schema, told["extension"], schema) == []
+    broken = told["extension"] | {"tensors": {"baked.means": {"dtype": "float64", "shape": [-1]}}}
+    assert len(faults(schema, broken, schema)) == 2
+
+
+def faults(schema: dict, value: object, root: dict, at: str = "") -> list[str]:
+    """Return the places of a value that a schema refuses, by those words of JSON schema that ours has."""
+    if "$ref" in schema:
+        schema = root["$defs"][schema["$ref"].rpartition("/")[2]]
+    kinds = {"object": dict, "array": list, "string": str, "integer": int}
+    if "const" in schema or "enum" in schema:
+        return [] if value in schema.get("enum", [schema.get("const")]) else [at]
+    if not isinstance(value, kinds.get(schema.get("type", ""), object)):
+        return [at]
+    found = [at] if isinstance(value, int) and value < schema.get("minimum", value) else []
+    if isinstance(value, dict):
+        found += [f"{at}/{name}" for name in schema.get("required", []) if name not in value]
+        for name, part in value.items():
+            more = schema.get("additionalProperties", {})
+            found += faults(
+                schema.get("properties", {}).get(name, {} if more is True else more), part, root, f"{at}/{name}"
+            )
+    elif isinstance(value, list):
+        found += [fault for part in value for fault in faults(schema.get("items", {}), part, root, at)]
+    return found

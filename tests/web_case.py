@@ -80,8 +80,10 @@ def build(folder: Path) -> Path:
 
 def bundle(source: Path, out: Path, *options: str) -> None:
     command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(source), "--bundle"]
-    packages = os.environ | {"NODE_PATH": str(WEB / "node_modules")}  # for what lies elsewhere, such as a fresh build
-    subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True, env=packages)
+    command += ["--format=esm", f"--outfile={out}", *options]
+    # A fresh build lies elsewhere than the packages.
+    packages = os.environ | {"NODE_PATH": str(WEB / "node_modules")}
+    subprocess.run(command, check=True, capture_output=True, env=packages)
 
 
 class _Server:

@@ -89,7 +89,7 @@ async function life(host, one, avatar, set, shot, note) {
   };
   one.setFace({ jawOpen: 0.8 });
   const wide = await shot(), { neutral } = avatar, faces = [neutral, one.face];
-  const motion = { fps: 2, ...Object.fromEntries(Object.keys(neutral).map((name) => [name, Float32Array.from(faces.flatMap((face) => Array.from(face[name])))])) };
+  const motion = { fps: 2, ...Object.fromEntries(Object.keys(one.face).map((name) => [name, Float32Array.from(faces.flatMap((face) => Array.from(face[name])))])) };
   one.setFace({});
   const rest = await shot();
   one.play(motion);
