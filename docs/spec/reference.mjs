@@ -28,7 +28,7 @@ const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const minus = (a, b) => a.map((x, i) => x - b[i]);
 const norm = (a) => Math.sqrt(dot(a, a));
-const row3 = (array, i) => Array.from(array.subarray(3 * i, 3 * i + 3));
+const row3 = (array, i) => Array.from(array.slice(3 * i, 3 * i + 3));
 const times = (A, B) => A.map((row) => range(B[0].length).map((j) => dot(row, B.map((other) => other[j]))));
 const transposed = (A) => A[0].map((_, j) => A.map((row) => row[j]));
 

@@ -11,7 +11,8 @@ import { Stage } from "mien-web/babylon";
 
 /** Opens an empty scene on a canvas, with a background of red, green and blue as the screen shows them. */
 export async function open(canvas, background) {
-  const engine = new Engine(canvas, false, { preserveDrawingBuffer: true }), scene = new Scene(engine);
+  const { width, height } = canvas, engine = new Engine(canvas, false, { preserveDrawingBuffer: true }), scene = new Scene(engine);
+  engine.setSize(width, height);
   scene.useRightHandedSystem = true;
   scene.clearColor = new Color4(...background, 1);
   const camera = new FreeCamera("camera", Vector3.Zero(), scene), stage = new Stage(scene);

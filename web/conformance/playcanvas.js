@@ -50,13 +50,16 @@ export async function open(canvas, background) {
     /** Draws until the engine's worker has sorted this picture, and returns it as a data address. */
     async draw() {
       stage.update(0, camera);
-      let shown = "";
-      for (let same = 0, last = ""; same < 2; last = shown) {
+      let shown = "", sorts = 0, same = 0;
+      const sorted = app.scene.on("gsplat:sorted", () => ++sorts && (same = 0));
+      // A sort may be on its way that began before: wait for one, or long enough that none can come.
+      for (let last = ""; same < (sorts ? 4 : 12); last = shown) {
         await frame();
         await new Promise((done) => setTimeout(done, 50));
         shown = canvas.toDataURL();
         same = shown === last ? same + 1 : 0;
       }
+      sorted.off();
       return shown;
     },
     close() {

@@ -1,6 +1,6 @@
 // Avatars in a scene of PlayCanvas (engine 2.23) as its own splats, which it sorts with all others.
 
-import { BoundingBox, Entity, GSplatContainer, GSplatFormat, PIXELFORMAT_RGBA32F, SHADERLANGUAGE_GLSL, ShaderChunks, Vec3, type AppBase, type Texture } from "playcanvas";
+import { BoundingBox, Entity, GSplatContainer, GSplatFormat, PIXELFORMAT_RGBA32F, SHADERLANGUAGE_GLSL, ShaderChunks, Vec3, WORKBUFFER_UPDATE_ONCE, type AppBase, type Texture } from "playcanvas";
 import { Actor, type Gaussians } from "./gaussians";
 import type { Avatar, Motion } from "./index";
 
@@ -58,6 +58,8 @@ export class SceneAvatar extends Actor {
       texture.unlock();
     }
     container.update(source.count);
+    // The engine copies splats once; without this, it would only sort them anew.
+    if (this.node.gsplat) this.node.gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE;
   }
 
   dispose(): void {
