@@ -182,7 +182,7 @@ def test_the_room_of_each_engine_runs(built: Path, site: Path, engine: str) -> N
     with web.served(folder) as address:
         told = web.browse(address, [web.script(wait)], size=(240, 160))
     assert told["results"] == [[2, False, 1]]
-    assert [message for message in told["messages"] if "rror" in message] == []
+    assert [message for message in told["messages"] if "Error" in message] == []
 
 
 def test_the_reference_of_the_spec_poses_as_python(tmp_path: Path) -> None:
