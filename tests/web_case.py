@@ -80,7 +80,10 @@ def build(folder: Path) -> Path:
 
 def bundle(source: Path, out: Path, *options: str) -> None:
     command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(source), "--bundle"]
-    subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True)
+    command += ["--format=esm", f"--outfile={out}", *options]
+    # A fresh build lies elsewhere than the packages.
+    packages = os.environ | {"NODE_PATH": str(WEB / "node_modules")}
+    subprocess.run(command, check=True, capture_output=True, env=packages)
 
 
 class _Server:

@@ -10,7 +10,7 @@ import { minify } from "terser";
 const here = dirname(fileURLToPath(import.meta.url));
 const folder = process.argv[2];
 const presets = JSON.stringify(JSON.parse(await readFile(join(here, "../src/mien/runtime/presets.json"), "utf8")));
-const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here, external: ["./webgpu.js"] };
+const options = { bundle: true, minify: true, target: "es2022", charset: "ascii", legalComments: "none", write: false, absWorkingDir: here, external: ["./webgpu.js", "three", "three/*", "@sparkjsdev/spark", "playcanvas", "@babylonjs/core/*"] };
 /** A number of a shader with no more digits than a float has. */
 const shorter = (number) => {
   const exact = Math.fround(number);
@@ -28,8 +28,13 @@ const shaders = {
       loader: "ts",
     })),
 };
-const bundle = async (entry, format, define = {}) => {
-  const result = await build({ ...options, plugins: [shaders], entryPoints: [entry], format, define: { PRESETS: presets, ...define } });
+/** Files of the package that others import, instead of a copy of their own. */
+const apart = {
+  name: "apart",
+  setup: (on) => on.onResolve({ filter: /^\.\/(index|gaussians)$/ }, ({ path }) => ({ path: path === "./index" ? "./mien.js" : `${path}.js`, external: true })),
+};
+const bundle = async (entry, format, define = {}, plugins = []) => {
+  const result = await build({ ...options, plugins: [shaders, ...plugins], entryPoints: [entry], format, define: { PRESETS: presets, ...define } });
   // esbuild bundles; terser makes what it bundles smaller still: 3 % of a page.
   const { code } = await minify(result.outputFiles[0].text, { ecma: 2020, module: format === "esm", compress: { passes: 3 }, mangle: true, format: { ascii_only: true } });
   return code.trimEnd();
@@ -56,6 +61,8 @@ const smaller = async (name) => {
 const template = await smaller("page.html");
 for (const [name, entry] of [["mien.js", "src/index.ts"], ["motion.js", "src/motion.ts"], ["element.js", "src/element.ts"], ["webgpu.js", "src/webgpu.ts"], ["webcam.js", "src/webcam.ts"]])
   await write(folder ? join(folder, name) : join(here, "dist", name), (await bundle(entry, "esm", detector)) + "\n");
+for (const name of ["gaussians", "three", "spark", "playcanvas", "babylon"])
+  await write(folder ? join(folder, `${name}.js`) : join(here, "dist", `${name}.js`), (await bundle(`src/${name}.ts`, "esm", {}, [apart])) + "\n");
 const page = (name, text, own = name, room = "formats/shared") => write(folder ? join(folder, own) : join(here, "../src/mien", room, name), text);
 await page("page.html", template.replace("{{script}}", () => script));
 await page("microphone.html", (await smaller("microphone_page.html")).replace("{{script}}", () => voice));
