@@ -192,7 +192,7 @@ def write_picture(path: Path, image: np.ndarray) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--gaussians", type=int, default=40_000)
     parser.add_argument("--side", type=int, default=512, help="pixels of a picture")
