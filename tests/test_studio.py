@@ -199,7 +199,8 @@ def test_two_hundred_hostile_requests_are_refused_and_change_nothing(serving: Se
         path = random.choice(
             (f"/api/people/{name}", f"{own}/films/{name}", f"{own}/take/{name}", f"/landmarker/{name}")
         )
-        body, headers = random.choice(BODIES), {"Content_Type": "application/json"}
+        body: bytes = random.choice(BODIES)
+        headers: dict[str, Any] = {"Content_Type": "application/json"}
         if number % 4 == 1:  # without the token
             path, method = random.choice(("/", "/api/people", own, film)), random.choice(("GET", "POST", "DELETE"))
             headers["Cookie"] = random.choice(("", token[:-1], f"{token}x", "mien_=", token.partition("=")[0] + "="))
