@@ -145,7 +145,7 @@ def without_features(config: MethodConfig) -> MethodConfig:
     ("method", "changes", "most"),
     [
         ("gaussian_avatars", {}, 90), ("headgas", {}, 90), ("mono_gaussian_avatar", {"frames_per_step": 1}, 120),
-        ("mono_gaussian_avatar", {}, 360),
+        ("mono_gaussian_avatar", {}, 285),
     ],
 )  # fmt: skip
 def test_a_step_of_a_paper_has_few_launches(method: str, changes: dict[str, int], most: int) -> None:
