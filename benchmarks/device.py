@@ -35,7 +35,7 @@ class Row:
 
 @dataclass
 class Clock:
-    """What is left of the budget."""
+    """The seconds that are left of the budget."""
 
     end: float
 

@@ -18,7 +18,7 @@ _NOTHING_TO_DO = 0.1  # share of the earlier time
 
 @dataclass(frozen=True)
 class StageTime:
-    """What one stage took."""
+    """The time and memory that one stage took."""
 
     seconds: float
     """Time that passed, in seconds."""
@@ -77,7 +77,7 @@ class StageTimes:
         return {name: own.seconds for name, own in self.stages.items()}
 
     def told(self) -> str:
-        """What took a second or more, for people: "tracking 120 s on 1.8 cores, training 364 s on 1.4"."""
+        """Tell people what took a second or more: "tracking 120 s on 1.8 cores, training 364 s on 1.4"."""
         long = {name: own for name, own in self.stages.items() if own.seconds >= 1}
         each = ", ".join(f"{name} {own.seconds:.0f} s on {own.cores:.1f} cores" for name, own in long.items())
         most = max((own.memory for own in self.stages.values()), default=0.0)

@@ -1,4 +1,4 @@
-"""What to film again: the few things of which an avatar has seen too little, by what its training pictures show."""
+"""Advice on what to film again: the few things that an avatar has seen too little of in its training pictures."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +20,7 @@ _FACES = {
     "Raise your eyebrows": (("browInnerUp", "browOuterUpLeft", "browOuterUpRight"), 0.3),
     "Shut your eyes for a second": (("eyeBlinkLeft", "eyeBlinkRight"), 0.5),
 }
-"""What to do, which expressions show it, and how strong one of them should be."""
+"""Each has what to do, which expressions show it, and how strong one of them should be."""
 
 
 def advice(portable: PortableAvatar) -> list[str]:

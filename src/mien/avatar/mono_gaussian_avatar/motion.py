@@ -71,7 +71,7 @@ class FreePoints(Avatar, ABC):
     bones: Int[Tensor, " s"]
     """Joints that move skin. The others only place these: FLAME has five here, and nine that move nothing."""
     slots: Int[Tensor, " k"]
-    """Which of these each joint is, or -1."""
+    """The place of each joint among these, or -1."""
 
     def new_deformation(self, face: FaceParams, form: WeightNorm) -> DeformationNet:
         """The network for faces of this kind, with random weights."""

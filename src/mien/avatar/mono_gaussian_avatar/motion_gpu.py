@@ -22,7 +22,7 @@ _SKINNING_SHARPNESS = tl.constexpr(SKINNING_SHARPNESS)
 
 
 class Surface(NamedTuple):
-    """What points are compared with, the same for all steps."""
+    """The surface that points are compared with, the same for all steps."""
 
     vertices: Tensor
     """The canonical vertices [v, 3]."""

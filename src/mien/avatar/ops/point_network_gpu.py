@@ -35,10 +35,10 @@ class Structure(NamedTuple):
     outputs: tuple[int, ...]
     activations: tuple[int, ...]
     sources: tuple[int, ...]
-    """Which values are read again: 0 for the inputs, 1 for the first layer's, or -1."""
+    """The values that are read again: 0 for the inputs, 1 for the first layer's, or -1."""
 
     def weights_at(self) -> tuple[int, ...]:
-        """Where each layer's weights begin. Its biases follow them. The last entry is the size of all."""
+        """The places at which each layer's weights begin. Its biases follow them. The last entry is the size of all."""
         starts = [0]
         for one, other, out in zip(self.inputs, self.extras, self.outputs, strict=True):
             starts.append(starts[-1] + (one + other + 1) * out)
@@ -240,7 +240,7 @@ def _pack_backward(
 @no_type_check
 @triton.jit
 def _layer_inputs(inputs, values, n, source: tl.constexpr, VALUES_AT: tl.constexpr):
-    """Where the values with a number lie: those of the inputs, or of a layer."""
+    """The place of the values with a number: those of the inputs, or of a layer."""
     if source == 0:
         return inputs
     return values + tl.cast(n, tl.int64) * VALUES_AT[source - 1]
