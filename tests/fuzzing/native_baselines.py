@@ -326,6 +326,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "make_face_model": make_face_model,
     "make_rig_topology": lambda c: c.given(c.size("v"), "<v t 3", "<t n"),
     "mean_squared_difference": lambda c: c.given("H W 3", "<256 H W 3:u1"),
+    "keep_loops_serial": lambda c: [c.flag()],
     "mesh_loss": mesh_loss,
     "observe_view": lambda c: c.given((2.0, 3.0), "n 2", "<3 n:i4", "n", "=n", "=n", "=n:i4", "=n"),
     "photometric_loss": lambda c: c.given(

@@ -108,6 +108,8 @@ class Extras:
     """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
     frames_per_step: Callable[[], int] = lambda: 1
     """Returns the number of training frames that the next optimiser step uses."""
+    apart: bool = False
+    """Whether the frames of a step share nothing but the trained tensors, so that each may have a thread of its own."""
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
     closing: int = 0

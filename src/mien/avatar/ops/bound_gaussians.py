@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
@@ -102,13 +102,15 @@ class _BoundGaussians(torch.autograd.Function):
         posed = _native.PosedGaussians(*known[10:])
         ctx.ride = _native.ride(data, topology, in_head, face, local, posed)
         ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
-        ctx.save_for_backward(*arrays, scales, opacities)
+        # PyTorch would make a tensor of each that it saves, and look whether other threads changed what shares memory
+        # with it: rows of one track. What is returned is kept without its history, or it would keep itself.
+        ctx.inputs, ctx.arrays, ctx.posed = inputs, arrays, (scales.data, opacities.data)
         return (means, quats, scales, opacities, head_pose) if in_head else (means, quats, scales, opacities)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        *saved, scales, opacities = ctx.saved_tensors
+        saved, (scales, opacities) = ctx.arrays, ctx.posed
         moves_face = any(ctx.needs_input_grad[5:9])
         of_face = [recycled_like(tensor) if moves_face else None for tensor in saved[2:6]]
         of_gaussians = [recycled_like(tensor) for tensor in saved[6:]]
@@ -127,4 +129,4 @@ class _BoundGaussians(torch.autograd.Function):
             _native.LocalGaussians(*known[15:19]),
             _native.FaceParameterGradients(*unpacked(*of_face)) if moves_face else None,
         )
-        return None, None, None, None, None, *of_face, *of_gaussians
+        return None, None, None, *left_to_autograd(ctx.inputs, [None, None, *of_face, *of_gaussians])

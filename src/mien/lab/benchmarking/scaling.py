@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, thread_cou
 from mien.machine.terminal import counted
 from mien.pages.pages import Axes, Series, write_chart
 from mien.render.rasterize import View, rasterize_each
+from mien.training.apart import threads_of_frames
 from mien.training.trainer import step
 
 COUNTS = (10_000, 30_000, 100_000, 300_000)
@@ -38,7 +40,11 @@ def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
         views: list[View] = [(scene.gaussians, scene.camera)] * pictures
         yield from _by_threads(f"rasterize_{pictures}_at_once", lambda v=views: _draw(v, scene.background), seconds)
     state, data, settings = default_case(load_face_model())
-    yield from _by_threads("train_step_default", lambda: step(state, data, settings), 4 * seconds)
+    for _ in _numbers_of_threads():
+        with threads_of_frames() as each:
+            own = replace(data, each=each)
+            timing = time_function(lambda own=own: step(state, own, settings), 4 * seconds)
+        yield benchmark_row("train_step_default", COUNT, SIZE, timing)
 
 
 @torch.no_grad()
@@ -47,10 +53,16 @@ def _draw(views: Sequence[View], background: Tensor) -> None:
 
 
 def _by_threads(name: str, function: Callable[[], object], seconds: float) -> Iterator[BenchmarkRow]:
+    for _ in _numbers_of_threads():
+        yield benchmark_row(name, COUNT, SIZE, time_function(function, seconds))
+
+
+def _numbers_of_threads() -> Iterator[None]:
+    """Set the number of native threads to 1, 2, 4 and more, up to all."""
     *_, most = thread_counts()
     for threads in sorted({*(1 << power for power in range(most.bit_length())), most}):
         _native.set_thread_count(threads)
-        yield benchmark_row(name, COUNT, SIZE, time_function(function, seconds))
+        yield
 
 
 def shares_that_do_not_scale(rows: Sequence[BenchmarkRow]) -> Iterator[str]:
