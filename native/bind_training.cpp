@@ -81,6 +81,19 @@ void adam_update(const std::vector<Group<AdamArrays>>& groups) {
   mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
 }
 
+void add_arrays(const std::vector<Array<const float>>& first, const std::vector<Array<const float>>& second,
+                const std::vector<Array<float>>& sums) {
+  require(second.size() == first.size() && sums.size() == first.size(), "there must be as many arrays of each kind");
+  std::vector<mien::SumTask> tasks;
+  tasks.reserve(sums.size());
+  for (size_t i = 0; i < sums.size(); ++i) {
+    require(same_shape(first[i], sums[i]) && same_shape(second[i], sums[i]), "arrays must have the shape of their sum");
+    tasks.push_back({first[i].data(), second[i].data(), sums[i].data(), static_cast<int64_t>(sums[i].size())});
+  }
+  const nb::gil_scoped_release release;
+  mien::add_arrays(tasks.data(), static_cast<int>(tasks.size()));
+}
+
 void triangle_penalties(const std::array<float, 2>& thresholds, const std::array<float, 2>& weights, const Rows3& means,
                         const Rows3& log_scales, const Radii& radii, const Array<float, nb::shape<-1, 3>>& grad_means,
                         const Array<float, nb::shape<-1, 3>>& grad_log_scales,
@@ -180,6 +193,7 @@ void bind_training(nb::module_& module) {
              "Makes one step of Adam with values [n, k, f], whose gradient is a sum of outer products.");
   module.def("adam_update", &adam_update, "tasks"_a,
              "Makes one step of Adam with every tensor. The number of steps grows by one.");
+  module.def("add_arrays", &add_arrays, "first"_a, "second"_a, "sums"_a, "Fills the sums of two arrays each.");
   module.def("triangle_penalties", &triangle_penalties, "thresholds"_a, "weights"_a, "means"_a, "log_scales"_a,
              "radii"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
              "Fills the position and the scale penalty, and their gradients.");

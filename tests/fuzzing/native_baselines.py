@@ -298,6 +298,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
         np.zeros(c.native.activation_shape(own), F32)],
     "adam_update": lambda c: [[
         Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01) for _ in range(c.size("a"))]],
+    "add_arrays": lambda c: [c.given("n", "n 3"), c.given("n", "n 3"), c.given("=n", "=n 3")],
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
     "align_mesh": lambda c: sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in c.given(
         c.AlignDerivatives("V 3 p", "=p p", "=p"), "=H W 3", "=H W 3"))),
@@ -341,6 +342,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "rasterize_views": lambda c: [views(c), c.flag(0.7)],
     "rasterize_views_backward": rasterize_views_backward,
     "recycled": lambda c: [[c.size("n"), c.size("m")]],
+    "recycled_twice": lambda c: [[c.size("n"), c.size("m")]],
     "ride": ride,
     "ride_backward": ride_backward,
     "ride_changes_backward": ride_changes_backward,

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cache, partial
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mien import _native
 from mien.adam import FactoredGradient, FactoredTerm
-from mien.arrays import own_derivative
+from mien.arrays import own_derivative, sums
 from mien.avatar.avatar import ParameterGroup, Posed
 from mien.avatar.settings import Progress
 from mien.gaussians import Rendering
@@ -35,10 +35,13 @@ class Part:
     """One frame of a step, or its side view, after its backward pass."""
 
     losses: Losses
+    """Of pictures, each as its part of the step's."""
     gradients: list[Tensor | None]
     """By the tensors that are trained, in the order of their groups."""
     terms: list[list[FactoredTerm]]
     """By the factored gradients."""
+    regularizers: Losses = field(default_factory=dict)
+    """Losses of the method, as if the frame were alone."""
     posed: Posed | None = None
     rendering: Rendering | None = None
     shown: Rendering | None = None
@@ -60,14 +63,26 @@ class _Trained:
             list({id(own): own for group in groups for own in group.factored.values()}.values()),
         )
 
-    def by(self, losses: Losses, offset: Tensor | None) -> tuple[list[Tensor | None], list[list[FactoredTerm]]]:
-        """Differentiate losses by all tensors, and by the offset of the centres, whose gradient stays with it."""
+    def by(
+        self, losses: Losses, regularizers: Losses, count: int, offset: Tensor | None
+    ) -> tuple[list[Tensor | None], list[list[FactoredTerm]]]:
+        """Differentiate losses by all tensors, and by the offset of the centres, whose gradient stays with it.
+
+        Regularizers count as means over `count` frames.
+        """
         inputs = [*self.tensors, *([] if offset is None else [offset])]
-        roots = list(losses.values())
-        found = list(torch.autograd.grad(roots, inputs, [own_derivative(loss) for loss in roots], allow_unused=True))
+        derivatives = [own_derivative(loss) for loss in losses.values()]
+        derivatives += [_share(count, loss.dtype, loss.device) for loss in regularizers.values()]
+        roots = [*losses.values(), *regularizers.values()]
+        found = list(torch.autograd.grad(roots, inputs, derivatives, allow_unused=True))
         if offset is not None:
             offset.grad = found.pop()
         return found, [own.take() for own in self.factored]
+
+
+@cache
+def _share(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, ""]:
+    return torch.full((), 1 / count, dtype=dtype, device=device)
 
 
 @contextmanager
@@ -103,38 +118,46 @@ def frames_apart(
     if state.head is not None and state.head.has_view:
         calls.append(partial(_side_view, state, progress, trained))
     parts = each(calls)
-    for index, tensor in enumerate(trained.tensors):
-        found = [part.gradients[index] for part in parts]
-        own = [gradient for gradient in found if gradient is not None]
-        tensor.grad = sum(own[1:], own[0]) if own else None
+    total = parts[0].gradients
+    for part in parts[1:]:
+        total = _added(total, part.gradients)
+    for tensor, gradient in zip(trained.tensors, total, strict=True):
+        tensor.grad = gradient
     for index, factored in enumerate(trained.factored):
         factored.terms.extend(term for part in parts for term in part.terms[index])
     return parts
 
 
+def _added(first: Items[Tensor | None], second: Items[Tensor | None]) -> list[Tensor | None]:
+    pairs = list(zip(first, second, strict=True))
+    both = [(a, b) for a, b in pairs if a is not None and b is not None]
+    found = iter(sums([a for a, _ in both], [b for _, b in both]))
+    return [next(found) if a is not None and b is not None else b if a is None else a for a, b in pairs]
+
+
 def _frame(state: TrainingState, one: BatchFrame, progress: Progress, count: int, trained: _Trained) -> Part:
     whole, (posed,), (rendering,) = draw(state, [one], progress)
     (shown,) = seen(state, [one], [rendering])
-    losses = compare(state, [one], [shown], count)
-    losses |= {name: own / count for name, own in state.avatar.regularizers(whole, rendering, progress).items()}
-    losses |= compare_features(state, [one], [shown], count)
-    gradients, terms = trained.by(losses, rendering.means2d_offset)
+    losses = compare(state, [one], [shown], count) | compare_features(state, [one], [shown], count)
+    regularizers = state.avatar.regularizers(whole, rendering, progress)
+    gradients, terms = trained.by(losses, regularizers, count, rendering.means2d_offset)
     # Density control sums lengths of gradients over frames, as if each were alone.
     assert rendering.means2d_offset.grad is not None
     rendering.means2d_offset.grad *= count
-    return Part(losses, gradients, terms, posed, rendering, shown)
+    return Part(losses, gradients, terms, regularizers, posed, rendering, shown)
 
 
 def _side_view(state: TrainingState, progress: Progress, trained: _Trained) -> Part:
     assert state.head is not None
     losses = state.head.losses(progress)
-    return Part(losses, *trained.by(losses, None))
+    return Part(losses, *trained.by(losses, {}, 1, None))
 
 
-def summed(parts: Items[Part]) -> Losses:
-    """The losses of a step by name."""
+def summed(parts: Items[Part], count: int) -> Losses:
+    """The losses of a step with `count` frames, by name."""
     total: Losses = {}
     for part in parts:
-        for name, loss in part.losses.items():
+        own = part.losses | {name: loss / count for name, loss in part.regularizers.items()}
+        for name, loss in own.items():
             total[name] = total[name] + loss.detach() if name in total else loss.detach()
     return total

@@ -312,9 +312,9 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     if head is not None:
         head.before_step(batch, data.meanwhile)
     groups = _groups(state, batch)
+    parts, losses = [], {}
     if avatar.extras.apart and len(batch) > 1:
         parts = frames_apart(state, batch, progress, groups, data.each)
-        losses = summed(parts)
         posed = [part.posed for part in parts if part.posed is not None]
         renderings = [part.rendering for part in parts if part.rendering is not None]
         shown = [part.shown for part in parts if part.shown is not None]
@@ -338,6 +338,7 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     state.seconds += elapsed
     if not progress.reaches(settings.record_every) and state.step != settings.steps:
         return ""
+    losses = losses or summed(parts, len(batch))
     return _record(state, losses, train_psnr(shown[0], batch[0].target), elapsed * 1000 / len(batch))
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import left_to_autograd, recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, recycled_twice, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
@@ -95,16 +95,16 @@ class _BoundGaussians(torch.autograd.Function):
     def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
         arrays = [tensor.contiguous() for tensor in inputs]
         count = len(arrays[-1])
-        means, quats, scales = (recycled(count, width) for width in (3, 4, 3))
-        opacities, head_pose = recycled(count), recycled(4, 4)
+        means, quats, head_pose = recycled(count, 3), recycled(count, 4), recycled(4, 4)
+        (scales, kept_scales), (opacities, kept_opacities) = recycled_twice((count, 3)), recycled_twice((count,))
         known = unpacked(*arrays, means, quats, scales, opacities, head_pose)
         face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:10])
         posed = _native.PosedGaussians(*known[10:])
         ctx.ride = _native.ride(data, topology, in_head, face, local, posed)
         ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
         # PyTorch would make a tensor of each that it saves, and look whether other threads changed what shares memory
-        # with it: rows of one track. What is returned is kept without its history, or it would keep itself.
-        ctx.inputs, ctx.arrays, ctx.posed = inputs, arrays, (scales.data, opacities.data)
+        # with it: rows of one track.
+        ctx.inputs, ctx.arrays, ctx.posed = inputs, arrays, (kept_scales, kept_opacities)
         return (means, quats, scales, opacities, head_pose) if in_head else (means, quats, scales, opacities)
 
     @staticmethod
