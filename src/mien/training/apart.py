@@ -86,9 +86,9 @@ def _share(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor
 
 
 @contextmanager
-def threads_of_frames() -> Iterator[Map]:
-    """Threads that end with the block, one for each core, each of which keeps to its own."""
-    count = _native.thread_count()
+def threads_of_frames(like: Tensor) -> Iterator[Map]:
+    """Threads that end with the block, one for each core, each of which keeps to its own. A GPU has one for all."""
+    count = _native.thread_count() if like.is_cpu else 1
     if count == 1:
         yield lambda calls: [call() for call in calls]
         return

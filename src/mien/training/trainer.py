@@ -154,7 +154,7 @@ def _train_to_the_end(
         one_torch_thread(),
         stops_put_off() as stop,
         targets_ahead(data.order, data.targets_at, settings) as ahead,
-        threads_of_frames() as each,
+        threads_of_frames(state.avatar.face_model.template) as each,
     ):
         data = replace(data, ahead=ahead, each=each)
         pretrain(state, settings, progress, stop.follow)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mien import _native
 from mien.face.loading import load_face_model
+from mien.lab.benchmarking import train_step
 from mien.lab.benchmarking.render import PAPER_SIZES, drawing_rows, head_scene
 from mien.lab.benchmarking.step_parts import COUNT, SIZE, default_case
 from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, thread_counts, time_function
@@ -41,7 +42,7 @@ def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
         yield from _by_threads(f"rasterize_{pictures}_at_once", lambda v=views: _draw(v, scene.background), seconds)
     state, data, settings = default_case(load_face_model())
     for _ in _numbers_of_threads():
-        with threads_of_frames() as each:
+        with threads_of_frames(train_step.ON_CPU) as each:
             own = replace(data, each=each)
             timing = time_function(lambda own=own: step(state, own, settings), 4 * seconds)
         yield benchmark_row("train_step_default", COUNT, SIZE, timing)
