@@ -49,4 +49,5 @@ void bind_memory(nb::module_& module) {
   module.def("recycled", &recycled, "shape"_a,
              "A float32 tensor with undefined values whose memory is kept for the next one of that size.");
   module.def("recycled_twice", &recycled_twice, "shape"_a, "Two tensors as that of `recycled` in the same memory.");
+  module.def("release_memory", &mien::release_memory, "Gives memory that nothing uses back to the system.");
 }

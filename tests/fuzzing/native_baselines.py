@@ -342,6 +342,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "rasterize_views": lambda c: [views(c), c.flag(0.7)],
     "rasterize_views_backward": rasterize_views_backward,
     "recycled": lambda c: [[c.size("n"), c.size("m")]],
+    "release_memory": lambda c: [],
     "recycled_twice": lambda c: [[c.size("n"), c.size("m")]],
     "ride": ride,
     "ride_backward": ride_backward,

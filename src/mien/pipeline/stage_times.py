@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from mien import _native
 from mien.disk.files import read_json, write_json
 from mien.errors import UserError
 from mien.machine.system import peak_memory_mb
@@ -50,6 +51,7 @@ class StageTimes:
     @contextmanager
     def measured(self, stage: str) -> Iterator[None]:
         """Measure the time inside the context."""
+        _native.release_memory()  # What the stages before took
         began, processor = time.monotonic(), _processor_seconds()
         yield
         spent = StageTime(

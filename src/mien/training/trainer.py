@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien import _native
 from mien.arrays import direct_gradients, own_derivative
 from mien.avatar.avatar import Avatar, ParameterGroup, Posed, move_avatar
 from mien.avatar.baking import measure_filmed
@@ -331,6 +332,8 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
         head.after_backward(progress, renderings)
 
     changed = _update(state, settings, batch, progress, groups, posed, renderings)
+    if changed:
+        _native.release_memory()  # Blocks of the sizes that tensors had are of no use.
     state.step = progress.done
     if head is not None:
         _after_update(state, head, data, progress, changed=changed)
