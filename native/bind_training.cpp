@@ -30,9 +30,9 @@ struct Corrections {
   float step_size, second_unbiased;
 };
 
-// Adam's corrections of its running means at the next step, which is counted.
-Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate) {
-  const double count = *steps.data() += 1;
+// Adam's corrections of its running means at the next step, which is counted and averages `frames`.
+Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate, int frames = 1) {
+  const double count = frames * static_cast<double>(*steps.data() += 1);
   return {static_cast<float>(rate / (1 - std::pow(kBeta1, count))),
           static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, count)))};
 }
@@ -40,22 +40,26 @@ Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate
 // One tensor's arrays, which stay alive while this does.
 struct AdamArrays {
   static constexpr char kName[] = "AdamTask";
-  static constexpr const char* kFields[] = {"values", "gradient", "first", "second", "steps", "rate"};
+  static constexpr const char* kFields[] = {"values", "gradient", "first", "second", "steps", "rate", "frames"};
   Array<float> values;
   Array<const float> gradient;
   Array<float> first, second;
   Array<float, nb::shape<>> steps;
   double rate = 0;
+  int frames = 1;
 
   explicit AdamArrays(const Group<AdamArrays>& group) {
-    group.read(values, gradient, first, second, steps, rate);
+    group.read(values, gradient, first, second, steps, rate, frames);
     require(same_shape(gradient, values) && same_shape(first, values) && same_shape(second, values),
             "gradient and moments must have the shape of the values");
+    require(frames > 0, "a step must average at least one frame");
   }
   mien::AdamTask step() const {
-    const Corrections found = next_corrections(steps, rate);
-    return {values.data(),   gradient.data(),      first.data(), second.data(), static_cast<int64_t>(values.size()),
-            found.step_size, found.second_unbiased};
+    const Corrections found = next_corrections(steps, rate, frames);
+    const mien::AdamDecays decays{static_cast<float>(std::pow(kBeta1, frames)),
+                                  static_cast<float>(std::pow(kBeta2, frames))};
+    return {values.data(),   gradient.data(),       first.data(), second.data(), static_cast<int64_t>(values.size()),
+            found.step_size, found.second_unbiased, decays};
   }
 };
 

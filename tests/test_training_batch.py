@@ -18,7 +18,7 @@ import train_toy
 from forked import ForkServer
 from instruction_sets import by_threads
 from known import known
-from mien.adam import Moments
+from mien.adam import BETA1, Moments
 from mien.arrays import direct_gradients
 from mien.avatar import Avatar
 from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
@@ -62,7 +62,8 @@ def pull_at(state: TrainingState, data: TrainingData, frame: int, name: str = "m
     """Return the gradient of the points in the first step, which begins at a frame: ten times the first moments."""
     state.step = frame
     step(state, data, SETTINGS)
-    return 10 * means_moments(state, name).first
+    averaged = state.avatar.extras.frames_per_step() if state.avatar.extras.apart else 1
+    return means_moments(state, name).first / (1 - BETA1**averaged)
 
 
 BOUND = plain_gaussian_avatars(scale_threshold=0.01)

@@ -67,13 +67,13 @@ class Kernel:
     compare: Callable[[int, Tensor, Tensor], None]
 
 
-def adam(given: Tensors, native: bool) -> Tensors:
+def adam(given: Tensors, native: bool, frames: int = 1) -> Tensors:
     def update() -> updates.Update:
         first, second, values, gradient = (tensor.clone() for tensor in given)
         return updates.Update(values, gradient, Moments(first, second, torch.tensor(3.0)), 0.01)
 
     one = update()
-    updates.update_all([one, update()]) if native else updates.update_reference(one)
+    updates.update_all([one, update()], frames) if native else updates.update_reference(one, frames=frames)
     return [one.values, one.moments.first, one.moments.second, one.moments.step]
 
 
@@ -307,8 +307,13 @@ def compare_activated(index: int, own: Tensor, truth: Tensor) -> None:
 COUNTS, PICTURES = (0, 1, 15, 16, 4097), ((1, 1), (7, 5), (40, 130), (200, 301))
 KERNELS = {
     # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
-    "adam": Kernel(lambda n: [0.1 * random(n, seed=1), random(n, seed=2).square(), random(n, seed=3), random(n)],
-                   adam, COUNTS, 20_000, near(1e-5, 1e-5)),
+    **{
+        f"adam{frames}": Kernel(
+            lambda n: [0.1 * random(n, seed=1), random(n, seed=2).square(), random(n, seed=3), random(n)],
+            partial(adam, frames=frames), COUNTS, 20_000, near(1e-5, 1e-5),
+        )
+        for frames in (1, 2)
+    },
     "factored": Kernel(factored_inputs, factored, ((1, 1, 0), (16, 3, 0), (19, 1, 4), (32, 2, 0)), (32, 2, 0),
                        near(1e-5, 1e-6)),
     "published": Kernel(published_inputs, published, ((1, 1, 0), (16, 1, 3), (19, 3, 0), (32, 2, 4)), (32, 1, 4),

@@ -298,6 +298,8 @@ class AdamTask(NamedTuple):
     steps: Tensor
     """Of no axes."""
     rate: float
+    frames: int
+    """Number of frames that the gradient averages."""
 
 def factored_adam_update(
     values: Tensor,

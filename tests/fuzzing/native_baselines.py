@@ -297,7 +297,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
         own := c.make_face_activations(*face_activations(c)), *c.given("j", "3", "3", "3"),
         np.zeros(c.native.activation_shape(own), F32)],
     "adam_update": lambda c: [[
-        Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01) for _ in range(c.size("a"))]],
+        Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01, 2) for _ in range(c.size("a"))]],
     "add_arrays": lambda c: [c.given("n", "n 3"), c.given("n", "n 3"), c.given("=n", "=n 3")],
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
     "align_mesh": lambda c: sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in c.given(

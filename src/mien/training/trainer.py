@@ -363,7 +363,7 @@ def _update(
     if state.density is not None:
         for own, rendering in zip(posed, renderings, strict=True):
             state.density.observe(own, rendering)
-    state.adam.step(groups, progress)
+    state.adam.step(groups, progress, len(batch) if state.avatar.extras.apart else 1)
     for one in batch:
         state.track.confine(one.index)
     if progress.reaches(STEADY_EVERY):
