@@ -28,7 +28,7 @@ class GaussianAvatarsConfig(MethodConfig):
 
     frames_per_step: Annotated[int, Range(1, 64)] = 2
     """Number of frames of an optimiser step, each on a thread of its own. Learning rates of Gaussians grow with the
-    root of it."""
+    root of it, and Adam's running means decay by frames."""
     photometric: Photometric = Photometric(
         alpha_weight=0.2, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
     )
