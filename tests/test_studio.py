@@ -22,7 +22,6 @@ pytest.importorskip("starlette")
 from mien import runtime
 from mien.cli import main
 from mien.studio import people as people_on_disk
-from mien.studio import server
 from mien.studio.advice import advice, advice_for
 from mien.studio.making import Maker, Settings
 from mien.studio.people import FullError, People
@@ -284,34 +283,6 @@ def test_a_killed_studio_takes_its_work_along_and_the_next_one_goes_on(tmp_path:
         until(lambda: state_of(serving, "Ada") == "making")
         (tmp_path / ".studio" / "go").touch()
         until(lambda: state_of(serving, "Ada") == "done")
-
-
-def test_a_phone_sends_one_film_and_reaches_nothing_else(
-    tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "address_on_network", lambda: "127.0.0.2")
-    with studio(tmp_path / "people", lan=True) as serving:
-        assert told(serving, "POST", "/api/people", {"name": "Ada", "agreed": True})[0] == 200
-        _, invited = told(serving, "POST", f"{person('Ada')}/phone", {})
-        assert invited["svg"].startswith("<svg")
-        found = re.fullmatch(r"http://(127\.0\.0\.2:(\d+))(/[\w-]{20,})/", invited["url"])
-        assert found is not None
-        host, port, base = found[1], int(found[2]), found[3]
-        there = {"port": port, "Host": host, "Origin": f"http://{host}", "Cookie": ""}
-        for path in ("/", "/api/people", "/index.html", f"{base[:-1]}/", person("Ada")):
-            assert asked(serving, "GET", path, **there)[0] == 404, path
-        for strange in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-            assert asked(serving, "GET", f"{base}/", **{**there, **strange})[0] == 403
-        assert b"Film yourself with this phone" in asked(serving, "GET", f"{base}/", **there)[2]
-        assert asked(serving, "PUT", f"{base}/piece?at=0", b"x", **there)[0] == 400
-        for _ in range(2):  # the first one loses its connection
-            assert asked(serving, "POST", f"{base}/begin", {"ending": "mp4"}, **there)[0] == 200
-        assert asked(serving, "PUT", f"{base}/piece?at=0", film.read_bytes(), **there)[0] == 200
-        assert told(serving, "GET", person("Ada"))[1]["phone"] == {"film": "film_1.mp4", "done": False}
-        assert asked(serving, "POST", f"{base}/done", {}, **there)[0] == 200
-        assert asked(serving, "GET", f"{base}/", **there)[0] == 404, "the token ends with the film"
-        shown = told(serving, "GET", person("Ada"))[1]
-        assert ([each["whole"] for each in shown["films"]], shown["phone"]["done"]) == ([True], True)
 
 
 def test_what_is_asked_for_again_is_what_was_seen_least(tmp_path: Path) -> None:

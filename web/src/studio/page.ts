@@ -59,3 +59,13 @@ export function duration(seconds: number): string {
   if (minutes < 90) return minutes <= 1 ? "a minute" : `${minutes} minutes`;
   return `${Math.round(seconds / 3600)} hours`;
 }
+
+/** Asks a question that “Delete” answers with yes. */
+export function sure(title: string, text: string): Promise<boolean> {
+  const dialog = find<HTMLDialogElement>("sure");
+  find("sure-title").textContent = title;
+  find("sure-words").textContent = text;
+  dialog.returnValue = "no";
+  dialog.showModal();
+  return new Promise((done) => dialog.addEventListener("close", () => done(dialog.returnValue === "yes"), { once: true }));
+}
