@@ -154,8 +154,8 @@ class Studio:
             ("GET", f"{person}/face", sends(lambda name: people.folder(name) / "face.jpg")),
             ("PUT", f"{person}/face", self._set_face),
             ("POST", f"{person}/films", does(self._begin_film, reads=True)),
-            ("PUT", film, self._append), ("POST", film, does(self._finish_film, reads=True)),
-            ("DELETE", film, does(self._remove_film)), ("GET", film, sends(people.film)),
+            ("PUT", film, self._append), ("POST", film, does(self._end_film, reads=True)),
+            ("DELETE", film, does(self._end_film)), ("GET", film, sends(people.film)),
             ("POST", f"{person}/making", does(self._make, reads=True)),
             ("DELETE", f"{person}/making", does(maker.drop)), ("GET", f"{person}/growing", sends(maker.growing)),
             ("GET", f"{person}/fit", sends(lambda name: people.folder(name) / "tracking_preview.html")),
@@ -205,18 +205,13 @@ class Studio:
     async def _append(self, request: Request) -> Response:
         return await append(request, self.people, request.path_params["name"], request.path_params["film"])
 
-    def _finish_film(self, name: str, film: str, content: Mapping[str, Any]) -> dict[str, Any]:
-        """Finish a film; `cut` keeps what has come of one that nobody sends any more."""
-        facts = self.people.finish_film(name, film, content.get("cut") is True)
+    def _end_film(self, name: str, film: str, content: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
+        """Finish a film, or remove it without `content`. A phone that was sending it sends no more."""
+        remove, finish = self.people.remove_film, self.people.finish_film
+        facts = remove(name, film) if content is None else finish(name, film, content.get("cut") is True)
         if self.phones is not None:
             self.phones.end(name, film)
         return facts
-
-    def _remove_film(self, name: str, film: str) -> None:
-        """Remove a film. A phone that was sending it sends no more."""
-        if self.phones is not None:
-            self.phones.end(name, film)
-        self.people.remove_film(name, film)
 
     def _make(self, name: str, content: Mapping[str, Any]) -> None:
         self.maker.add(name, Settings.of(content))
@@ -259,7 +254,7 @@ class Studio:
             **self._short(name), "takings": takings, "settings": noted.get("settings", asdict(Settings())),
             "films": [{**asdict(film), "facts": dict(film.facts)} for film in self.people.films(name)],
             "growing": _changed(self.maker.growing(name)), "fit": _changed(folder / "tracking_preview.html"),
-            "advice": advice_for(folder / "me.mien") if run is not None else [],
+            "advice": advice_for(folder / "me.mien", run) if run is not None else [],
             "phone": None if self.phones is None else self.phones.state(name),
         }  # fmt: skip
 

@@ -175,10 +175,7 @@ class People:
         return at + len(piece)
 
     def finish_film(self, name: str, film: str, cut: bool = False) -> dict[str, Any]:
-        """End a film that was begun, and return its facts.
-
-        What is no film is removed, with the reason. A film that is `cut`, since its end never came, stays.
-        """
+        """End a film that was begun, and return its facts. What is no film is removed, unless it was cut."""
         part = self._part_of(name, film)
         facts = _probed(part)
         if facts is None and cut:

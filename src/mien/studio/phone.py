@@ -47,10 +47,7 @@ class Phones:
         self._change = threading.Lock()
 
     def invite(self, name: str) -> dict[str, str]:
-        """Invite a phone, and return the address and its QR code as svg.
-
-        An earlier invitation of the person ends, unless a film has begun to come by it: then it is given again.
-        """
+        """Invite a phone, and return the address and its QR code as svg. They stay the same while a film comes."""
         with self._change:
             invited = self._invited.get(name)
             if invited is None or invited.done or invited.film is None:
@@ -70,9 +67,7 @@ class Phones:
         """Whether a phone is invited to film a person, and how far its film is; None without an invitation."""
         with self._change:
             invited = self._invited.get(name)
-        if invited is None:
-            return None
-        return {"film": invited.film, "size": invited.sent_as[1], "done": invited.done}
+        return invited and {"film": invited.film, "size": invited.sent_as[1], "done": invited.done}
 
     def app(self) -> Starlette:
         """The answers to phones."""
@@ -91,6 +86,12 @@ class Phones:
                 if hmac.compare_digest(invited.token.encode(), token) and not invited.done:
                     return invited
         raise NotThereError("this address has ended; ask for a new code in the studio")
+
+    def _sending(self, request: Request) -> tuple[Invitation, str]:
+        invited = self._invitation(request)
+        if invited.film is None:
+            raise UserError("the film has not begun; begin it first")
+        return invited, invited.film
 
     async def _page(self, request: Request) -> Response:
         self._invitation(request)
@@ -115,17 +116,13 @@ class Phones:
         return 0
 
     async def _append(self, request: Request) -> Response:
-        invited = self._invitation(request)
-        if invited.film is None:
-            raise UserError("the film has not begun; begin it first")
-        return await append(request, self.people, invited.name, invited.film)
+        invited, film = self._sending(request)
+        return await append(request, self.people, invited.name, film)
 
     async def _done(self, request: Request) -> Response:
-        invited = self._invitation(request)
+        invited, film = self._sending(request)
         await json_of(request)
-        if invited.film is None:
-            raise UserError("the film has not begun; begin it first")
-        facts = await run_in_threadpool(self.people.finish_film, invited.name, invited.film)
+        facts = await run_in_threadpool(self.people.finish_film, invited.name, film)
         invited.done = True
         return JSONResponse(facts)
 
