@@ -21,6 +21,7 @@ pytest.importorskip("starlette")
 
 from mien import runtime
 from mien.cli import main
+from mien.disk.files import write_arrays, write_json
 from mien.studio import people as people_on_disk
 from mien.studio.advice import advice, advice_for
 from mien.studio.making import Maker, Settings
@@ -296,11 +297,44 @@ def test_what_is_asked_for_again_is_what_was_seen_least(tmp_path: Path) -> None:
     seen = replace(head, filmed=runtime.Filmed(rest, most, angles))
     assert advice(seen) == ["Turn your head further to the right", "Say a long A, with your mouth wide open"]
     assert advice(replace(head, filmed=None)) == []
-    runtime.write_portable(tmp_path / "me.mien", seen)
-    assert advice_for(tmp_path / "me.mien") == advice(seen)
-    (tmp_path / "me.mien").write_bytes(b"damaged")
-    os.utime(tmp_path / "me.mien", (1, 1))
-    assert advice_for(tmp_path / "me.mien") == []
+    path = tmp_path / "me.mien"
+    runtime.write_portable(path, seen)
+    assert advice_for(path, "one") == advice(seen)
+    write_scores(tmp_path, head, "Lower your chin")
+    assert advice_for(path, "one") == [*advice(seen), AGAIN]
+    write_scores(tmp_path, head, "")
+    assert advice_for(path, "one") == advice(seen), "a face is as good as the rest"
+    (tmp_path / "runs" / "one" / "metrics.json").write_text("{}")
+    assert advice_for(path, "one") == advice(seen)
+    path.write_bytes(b"damaged")
+    assert advice_for(path, "one") == []
+
+
+AGAIN = "Lower your chin, and look down, once more and slowly: the avatar is least like you there"
+
+
+def write_scores(workspace: Path, head: runtime.PortableAvatar, worse: str) -> None:
+    """Write figures of twenty held-out frames. In half of them the chin is lowered, and in some the mouth is open."""
+    count, names = 20, head.expression_names
+    expression = np.tile(head.neutral.expression, (count, 1))
+    expression[::3, names.index("jawOpen")] += 1
+    rotation = np.zeros((count, 3), np.float32)
+    rotation[::2, 0] = np.radians(12)  # the camera sees the head from above
+    view = np.diag([1.0, -1, -1, 1]).astype(np.float32)
+    view[2, 3] = 1.0
+    tracked = {
+        "expression": expression, "head_rotation": rotation, "head_translation": np.zeros((count, 3), np.float32),
+        "camera_viewmats": view[None],
+    }  # fmt: skip
+    write_arrays(workspace / "sequences" / "film_1" / "tracking" / "tracking.safetensors", tracked)
+    psnr = np.full(count, 30.0)
+    psnr[::2] -= 4 if worse else 1
+    mouth = [None, *np.full(count - 1, 30.0)]
+    figures = {"head_psnr": psnr.tolist(), "eyes_psnr": [30.0] * count, "mouth_psnr": mouth}
+    frames = {"sequence": ["film_1"] * count, "timestep": list(range(count)), **figures}
+    write_json(
+        workspace / "runs" / "one" / "metrics.json", "mien.metrics", 1, {"protocols": {"self": {"per_frame": frames}}}
+    )
 
 
 def test_takings_are_written_by_export_and_old_ones_are_not_given(serving: Serving, film: Path) -> None:
