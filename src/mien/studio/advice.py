@@ -1,6 +1,7 @@
 """Advice on what to film again: what an avatar has seen too little of, and where it is least like the person."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -30,13 +31,9 @@ _FACES = {
     "Shut your eyes for a second": (("eyeBlinkLeft", "eyeBlinkRight"), 0.5, "eyes"),
 }
 """Each has what to do, which expressions show it, how strong one of them should be, and the part whose error tells."""
-_SHOWN = 0.5
-"""Share of a turn or a face from which a held-out frame shows it."""
-_PARTS = ("head", "eyes", "mouth")
-_LEAST_FRAMES = 5
-"""Held-out frames that have to show a turn or a face, and not to show it, before their errors are compared."""
-_CLEARLY = 2.0
-"""Decibels by which a part has to be worse in the frames that show something before that is asked for again."""
+_SHOWN, _LEAST_FRAMES, _CLEARLY = 0.5, 5, 2.0
+"""Share of a turn or a face from which a held-out frame shows it, how many have to show it, and as many not to, and by
+how many decibels they have to be worse before it is asked for again."""
 
 
 def advice(portable: PortableAvatar, worst: str = "") -> list[str]:
@@ -73,20 +70,18 @@ def worst_shown(
 
 def advice_for(path: Path, run: str) -> list[str]:
     """The same for the .mien file of a workspace, and its run; nothing if the file is missing or damaged."""
-    scored = path.parent / "runs" / run / "metrics.json"
     try:
-        return list(_remembered(path, path.stat().st_mtime_ns, scored, scored.is_file() and scored.stat().st_mtime_ns))
+        return list(_remembered(path, path.stat().st_mtime_ns, path.parent / "runs" / run / "metrics.json"))
     except (OSError, UserError):
         return []
 
 
 @lru_cache(maxsize=64)
-def _remembered(path: Path, changed: int, scored: Path, scored_at: int) -> tuple[str, ...]:
-    portable = read_portable(path)
-    try:
-        return tuple(advice(portable, _worst_of(portable, scored)))
-    except (OSError, UserError, LookupError, ValueError, TypeError):  # not evaluated, or the footage was not kept
-        return tuple(advice(portable))
+def _remembered(path: Path, changed: int, scored: Path) -> tuple[str, ...]:
+    portable, worst = read_portable(path), ""
+    with suppress(OSError, UserError, LookupError, ValueError, TypeError):  # not scored, or the footage was not kept
+        worst = _worst_of(portable, scored)
+    return tuple(advice(portable, worst))
 
 
 def _worst_of(portable: PortableAvatar, scored: Path) -> str:
@@ -99,7 +94,8 @@ def _worst_of(portable: PortableAvatar, scored: Path) -> str:
         expression[rows] = tracked["expression"][at[rows]]
         rotation, translation = (tracked[f"head_{name}"][at[rows]] for name in ("rotation", "translation"))
         angles[rows] = head_angles(rotation, translation, -T_camera_world[:3, :3].T @ T_camera_world[:3, 3])
-    return worst_shown(portable, expression, angles, {part: frames[f"{part}_psnr"] for part in _PARTS})
+    psnr = {part: frames[f"{part}_psnr"] for part in ("head", "eyes", "mouth")}
+    return worst_shown(portable, expression, angles, psnr)
 
 
 def _shares(portable: PortableAvatar, expression: np.ndarray) -> dict[str, np.ndarray]:

@@ -179,13 +179,11 @@ class Studio:
 
     def _add(self, content: Mapping[str, Any]) -> dict[str, str]:
         """Add a person, who must have agreed."""
-        name = content.get("name")
         if content.get("agreed") is not True:
             raise UserError("the person has to agree before the first recording; ask, and confirm it")
-        if not isinstance(name, str):
-            raise UserError("the request has no name; give one")
-        self.people.add(name.strip())
-        return {"name": name.strip()}
+        name = given.strip() if isinstance(given := content.get("name"), str) else ""
+        self.people.add(name)
+        return {"name": name}
 
     def _remove(self, name: str) -> None:
         """Remove a person with everything."""

@@ -225,7 +225,9 @@ class Maker:
         began = None if self._printed else (time.monotonic(), 0.0)  # an earlier attempt has done a part
         self._pace = _Pace(settings.quality, self._usual(settings.quality), began)
         state = attempt(self.batch.root, self._program, settings.threads or None, row)
-        if self._ended or not self._is_next(row):
+        with self._change:
+            is_next = any(each is row for each in self._queue[:1])
+        if self._ended or not is_next:
             return  # stopped by the end of the studio, or by a person
         if state is None:
             time.sleep(1.0)  # the process of a studio that was killed is about to end
@@ -233,10 +235,6 @@ class Maker:
         if state.status == "done" and not settings.keep_film:
             self.people.drop_footage(row.name)
         self._conclude(row, state)
-
-    def _is_next(self, row: Row) -> bool:
-        with self._change:
-            return bool(self._queue) and self._queue[0] is row
 
     def _conclude(self, row: Row, state: State | None) -> None:
         """Take a row that has ended out of the queue."""

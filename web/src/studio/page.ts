@@ -23,6 +23,8 @@ export async function busy(which: HTMLButtonElement, act: () => unknown): Promis
   which.disabled = true;
   await attempt(act);
   which.disabled = false;
+  // A button that cannot be pressed loses the focus.
+  if (document.activeElement === document.body) which.focus();
 }
 
 let clearing = 0;

@@ -28,7 +28,7 @@ function showList(): void {
 }
 
 function showPerson(): void {
-  const { name, films } = now.whole!;
+  const { name, films } = now.whole!, focused = document.activeElement;
   if (find("title").textContent !== name) find("title").textContent = name;
   const rows = films.map((each, k) => ({ each, number: k + 1 })).filter(({ each }) => !sent.has(each.name));
   fill("films", [rows, [...checked], now.whole!.phone?.film], () => rows.map(({ each, number }) => filmRow(name, each, number)));
@@ -38,6 +38,8 @@ function showPerson(): void {
   showMaking();
   showTakings();
   showStage();
+  // What had the focus may have gone, such as “Stop” at the end of the making.
+  if (focused instanceof HTMLElement && !focused.checkVisibility()) find("title").focus();
   const state = now.whole!.phone, told = find("phone-state"), words = phoneWords();
   if (told.textContent !== words) told.textContent = words;
   if (state?.done && find<HTMLDialogElement>("phone").open) {
@@ -139,10 +141,12 @@ function connect(): void {
     now.chosen = "";
     await ask("POST", person(now.whole!.name, "making"), settings());
     await look();
+    button("stop").focus();
   });
   start("stop", async () => {
     await ask("DELETE", person(now.whole!.name, "making"));
     await look();
+    button("make").focus();
   });
   start("be-me", beMe);
   start("neutral", () => webcam.calibrate());
