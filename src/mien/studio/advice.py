@@ -13,10 +13,9 @@ from mien.runtime.baked import PortableAvatar
 from mien.runtime.file import read_portable
 from mien.runtime.filmed import head_angles
 
-_MOST = 3
-"""Number of things that are asked for at once."""
-_SIDE, _UP_OR_DOWN = np.radians(35.0), np.radians(12.0)
-"""How far a camera should have seen the head from each side, and from above and below. Fills begin beyond it."""
+_MOST, _SIDE, _UP_OR_DOWN = 3, np.radians(35.0), np.radians(12.0)
+"""Number of things that are asked for at once, and how far a camera should have seen the head from each side, and from
+above and below. Fills begin beyond it."""
 _TURNS = {
     # A camera sees the person's right side when the head turns to the left.
     "Turn your head further to the left": (0, -_SIDE), "Turn your head further to the right": (0, _SIDE),
@@ -45,8 +44,8 @@ def advice(portable: PortableAvatar, worst: str = "") -> list[str]:
         found = [words for share, words in sorted((share, words) for words, share in shares.items()) if share < 0.9]
     if not worst or worst in found[:_MOST]:
         return found[:_MOST]
-    again = worst.replace("further ", "")
-    return [*found[: _MOST - 1], f"{again}, once more and slowly: the avatar is least like you there"]
+    again = f"{worst.replace('further ', '')}, once more and slowly: the avatar is least like you there"
+    return [*found[: _MOST - 1], again]
 
 
 def worst_shown(

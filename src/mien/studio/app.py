@@ -32,20 +32,20 @@ if TYPE_CHECKING:
     import mien.studio.phone
 
 _MOST_JSON = 16 << 10
-_PAGES = Path(__file__).parent
 _FRAMED = "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"
 """Policy of files: a page from a workspace has no origin, so it can ask the studio for nothing."""
 _STATUS = {
     NotThereError: HTTPStatus.NOT_FOUND, OtherPlaceError: HTTPStatus.CONFLICT,
     FullError: HTTPStatus.INSUFFICIENT_STORAGE, CannotWriteError: HTTPStatus.INSUFFICIENT_STORAGE,
 }  # fmt: skip
+_landmarker_files = cache(webcam_files)
 Answering = Callable[[Request], Awaitable[Response]]
 
 
 @cache
 def page(name: str) -> tuple[bytes, str]:
     """A page of the studio, built from web/, and its policy: it loads nothing, and runs its own script alone."""
-    text = (_PAGES / name).read_text(encoding="utf-8")
+    text = (Path(__file__).parent / name).read_text(encoding="utf-8")
 
     def allowed(tag: str) -> str:
         inside = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
@@ -112,10 +112,7 @@ async def append(request: Request, people: People, name: str, film: str) -> Resp
 
 
 def does(act: Callable[..., Any], reads: bool = False) -> Answering:
-    """An answer that calls a function with what the path names, in a thread, and sends what it returns as json.
-
-    A POST has to bring json, which no form of another page can send. With `reads`, the function gets it as `content`.
-    """
+    """An answer that calls a function with what the path names. A POST brings json, which is `content` with `reads`."""
 
     async def doing(request: Request) -> Response:
         content = await json_of(request) if request.method == "POST" else {}
@@ -260,9 +257,6 @@ class Studio:
 def _changed(path: Path) -> int | None:
     """When a file changed, as a mark for the page; None if it is missing."""
     return path.stat().st_mtime_ns if path.is_file() else None
-
-
-_landmarker_files = cache(webcam_files)
 
 
 async def _landmarker(request: Request) -> Response:

@@ -77,10 +77,7 @@ class _Pace:
     """How fast the work of an attempt goes."""
 
     def __init__(self, quality: str, usual: float | None, began: tuple[float, float] | None) -> None:
-        """Begin an attempt. `usual` is how long the whole work took on this machine; None if nothing was made yet.
-
-        `began` is when it began, and how much was done by then, 0 to 1; None if the first look has to tell that.
-        """
+        """Begin an attempt. `usual` has the seconds of all work; `began` when it began, and the share done by then."""
         self._usual = usual
         self._shares = {**_SHARES, "training": _TRAININGS.get(quality, _SHARES["training"])}
         self._began = began

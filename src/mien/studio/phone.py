@@ -53,8 +53,7 @@ class Phones:
             if invited is None or invited.done or invited.film is None:
                 self._invited[name] = invited = Invitation(name, secrets.token_urlsafe(18))
         url = f"{self.address}/{invited.token}/"
-        code = segno.make(url, error="m").svg_inline(scale=6, border=4, dark="#000", light="#fff")
-        return {"url": url, "svg": code}
+        return {"url": url, "svg": segno.make(url, error="m").svg_inline(scale=6, border=4, dark="#000", light="#fff")}
 
     def end(self, name: str, film: str | None = None) -> None:
         """End the invitation of a person; with `film`, only the one by which that film comes."""
