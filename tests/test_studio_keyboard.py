@@ -22,13 +22,14 @@ def test_the_keyboard_alone_is_enough(tmp_path: Path) -> None:
     films = [
         {"tab": "#new"}, {"keys": ["Enter", *"Ada", "Tab", "Space"]}, {"tab": "#add .main"}, {"keys": ["Enter"]},
         {"see": "Half a minute of film is enough."}, {"tab": "#film"}, {"keys": ["Enter"]}, {"see": "Put your face"},
-        {"keys": ["Enter"]}, {"see": "kB saved"}, {"keys": ["Enter"]}, {"see": "Film 1"},
+        {"focused": "#record"}, {"keys": ["Enter"]}, {"see": "kB saved"}, {"focused": "#finish"}, {"keys": ["Enter"]},
+        {"see": "Film 1"},
     ]  # fmt: skip
     makes = [
         {"tab": "#people button"}, {"keys": ["Enter"]}, {"see": "Film 1"}, {"tab": "#more summary"},
         {"keys": ["Enter"]}, {"tab": "#quality"}, {"keys": ["Home"]}, {"tab": "#keep"}, {"keys": ["Space"]},
-        {"back": "#make"}, {"keys": ["Enter"]}, {"see": "The avatar grows"}, {"keys": ["Enter"]}, {"see": "Go on"},
-        {"keys": ["Enter"]}, {"see": "The avatar grows"},
+        {"back": "#make"}, {"keys": ["Enter"]}, {"focused": "#stop"}, {"keys": ["Enter"]}, {"focused": "#make"},
+        {"see": "Go on"}, {"keys": ["Enter"]}, {"focused": "#stop"}, {"see": "The avatar grows"},
     ]  # fmt: skip
     takes = [
         {"tab": "#people button"}, {"keys": ["Enter"]}, {"see": "Take away"}, {"tab": '[aria-label="Save: Page"]'},

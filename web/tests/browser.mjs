@@ -5,7 +5,7 @@
 //   "scripts": [..], "screenshots": [path or null, ..], "whole": true for screenshots of the whole page and not of the window
 //   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"press": selector},
 //     {"keys": names}, {"tab": selector}: Tab until that has the focus, {"back": selector}: the same by Shift+Tab; the focus
-//     has to be seen at each place, {"drag": [x, y]},
+//     has to be seen at each place, {"focused": selector}: wait until the page gives it the focus, {"drag": [x, y]},
 //     {"fill": [label, text]}, {"give": [selector of an input, path]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
 //     {"settled": path}: a screenshot that differs from the last one and stays as it is
 //   "webgpu": true for WebGPU in software, "flags": further options of Chromium, "downloads": folder, "opening": a script
@@ -92,6 +92,7 @@ function actions(tab, width, height, shapes) {
     },
     tab: (selector) => walk(tab, "Tab", selector),
     back: (selector) => walk(tab, "Shift+Tab", selector),
+    focused: (selector) => tab.locator(`${selector}:focus`).waitFor(),
     fill: ([label, text]) => tab.locator(`xpath=//*[text()="${label}"]/following::input[1]`).fill(text),
     give: ([selector, path]) => tab.locator(selector).setInputFiles(path),
     screenshot: (path) => tab.screenshot({ path }),
