@@ -7,17 +7,21 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from mien.batch.plan import Batch, Row
-from mien.batch.row import RowFailedError, row_process
+from mien.batch.row import RowFailedError, do_steps, row_process
+from mien.cli import main
 from mien.studio.making import Maker
 from mien.studio.people import People
 from mien.studio.server import Serving
 
 STUB = (sys.executable, str(Path(__file__).resolve()))
+SHORT = (*STUB, "short")
+"""The program that makes an avatar by `mien create` itself, in few steps."""
 
 
 @contextmanager
@@ -85,5 +89,13 @@ def make_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[
     return (), {}
 
 
+def make_short(batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
+    """Make an avatar by the commands of a row, in few steps."""
+    create, export = row.steps
+    few = ("--steps", "60")
+    return do_steps(main, batch, replace(row, steps=((*create, *few), export)))
+
+
 if __name__ == "__main__":
-    sys.exit(row_process(Path(sys.argv[-1]), sys.stdin, make_stub))
+    makes = make_short if "short" in sys.argv else make_stub
+    sys.exit(row_process(Path(sys.argv[-1]), sys.stdin, makes))

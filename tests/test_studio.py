@@ -21,8 +21,8 @@ pytest.importorskip("starlette")
 
 from mien import runtime
 from mien.cli import main
+from mien.disk.files import write_arrays, write_json
 from mien.studio import people as people_on_disk
-from mien.studio import server
 from mien.studio.advice import advice, advice_for
 from mien.studio.making import Maker, Settings
 from mien.studio.people import FullError, People
@@ -286,34 +286,6 @@ def test_a_killed_studio_takes_its_work_along_and_the_next_one_goes_on(tmp_path:
         until(lambda: state_of(serving, "Ada") == "done")
 
 
-def test_a_phone_sends_one_film_and_reaches_nothing_else(
-    tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, "address_on_network", lambda: "127.0.0.2")
-    with studio(tmp_path / "people", lan=True) as serving:
-        assert told(serving, "POST", "/api/people", {"name": "Ada", "agreed": True})[0] == 200
-        _, invited = told(serving, "POST", f"{person('Ada')}/phone", {})
-        assert invited["svg"].startswith("<svg")
-        found = re.fullmatch(r"http://(127\.0\.0\.2:(\d+))(/[\w-]{20,})/", invited["url"])
-        assert found is not None
-        host, port, base = found[1], int(found[2]), found[3]
-        there = {"port": port, "Host": host, "Origin": f"http://{host}", "Cookie": ""}
-        for path in ("/", "/api/people", "/index.html", f"{base[:-1]}/", person("Ada")):
-            assert asked(serving, "GET", path, **there)[0] == 404, path
-        for strange in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-            assert asked(serving, "GET", f"{base}/", **{**there, **strange})[0] == 403
-        assert b"Film yourself with this phone" in asked(serving, "GET", f"{base}/", **there)[2]
-        assert asked(serving, "PUT", f"{base}/piece?at=0", b"x", **there)[0] == 400
-        for _ in range(2):  # the first one loses its connection
-            assert asked(serving, "POST", f"{base}/begin", {"ending": "mp4"}, **there)[0] == 200
-        assert asked(serving, "PUT", f"{base}/piece?at=0", film.read_bytes(), **there)[0] == 200
-        assert told(serving, "GET", person("Ada"))[1]["phone"] == {"film": "film_1.mp4", "done": False}
-        assert asked(serving, "POST", f"{base}/done", {}, **there)[0] == 200
-        assert asked(serving, "GET", f"{base}/", **there)[0] == 404, "the token ends with the film"
-        shown = told(serving, "GET", person("Ada"))[1]
-        assert ([each["whole"] for each in shown["films"]], shown["phone"]["done"]) == ([True], True)
-
-
 def test_what_is_asked_for_again_is_what_was_seen_least(tmp_path: Path) -> None:
     head = drawn_head(10)
     names, size = head.expression_names, len(head.neutral.expression) + head.neutral.joints.size
@@ -325,11 +297,44 @@ def test_what_is_asked_for_again_is_what_was_seen_least(tmp_path: Path) -> None:
     seen = replace(head, filmed=runtime.Filmed(rest, most, angles))
     assert advice(seen) == ["Turn your head further to the right", "Say a long A, with your mouth wide open"]
     assert advice(replace(head, filmed=None)) == []
-    runtime.write_portable(tmp_path / "me.mien", seen)
-    assert advice_for(tmp_path / "me.mien") == advice(seen)
-    (tmp_path / "me.mien").write_bytes(b"damaged")
-    os.utime(tmp_path / "me.mien", (1, 1))
-    assert advice_for(tmp_path / "me.mien") == []
+    path = tmp_path / "me.mien"
+    runtime.write_portable(path, seen)
+    assert advice_for(path, "one") == advice(seen)
+    for run, worse, words in (("two", 4.0, [AGAIN]), ("three", 1.0, [])):
+        write_scores(tmp_path, head, run, worse)
+        assert advice_for(path, run) == [*advice(seen), *words]
+    (tmp_path / "runs" / "three" / "metrics.json").write_text("{}")
+    path.touch()
+    assert advice_for(path, "three") == advice(seen)
+    path.write_bytes(b"damaged")
+    assert advice_for(path, "two") == []
+
+
+AGAIN = "Lower your chin, and look down, once more and slowly: the avatar is least like you there"
+
+
+def write_scores(workspace: Path, head: runtime.PortableAvatar, run: str, worse: float) -> None:
+    """Write figures of twenty held-out frames. In half of them the chin is lowered, and in some the mouth is open."""
+    count, names = 20, head.expression_names
+    expression = np.tile(head.neutral.expression, (count, 1))
+    expression[::3, names.index("jawOpen")] += 1
+    rotation = np.zeros((count, 3), np.float32)
+    rotation[::2, 0] = np.radians(12)  # the camera sees the head from above
+    view = np.diag([1.0, -1, -1, 1]).astype(np.float32)
+    view[2, 3] = 1.0
+    tracked = {
+        "expression": expression, "head_rotation": rotation, "head_translation": np.zeros((count, 3), np.float32),
+        "camera_viewmats": view[None],
+    }  # fmt: skip
+    write_arrays(workspace / "sequences" / "film_1" / "tracking" / "tracking.safetensors", tracked)
+    psnr = np.full(count, 30.0)
+    psnr[::2] -= worse
+    mouth = [None, *np.full(count - 1, 30.0)]
+    figures = {"head_psnr": psnr.tolist(), "eyes_psnr": [30.0] * count, "mouth_psnr": mouth}
+    frames = {"sequence": ["film_1"] * count, "timestep": list(range(count)), **figures}
+    write_json(
+        workspace / "runs" / run / "metrics.json", "mien.metrics", 1, {"protocols": {"self": {"per_frame": frames}}}
+    )
 
 
 def test_takings_are_written_by_export_and_old_ones_are_not_given(serving: Serving, film: Path) -> None:

@@ -16,7 +16,6 @@ pytest.importorskip("starlette")
 from forked import ForkServer
 from mien import runtime
 from mien.formats.page import write_page
-from mien.studio import server
 from mien.studio.people import People
 from mien.studio.server import Serving
 from needs import NO_NAMESPACE
@@ -24,7 +23,7 @@ from refusals import refuses
 from studio_case import STUB, give_film, person, studio, told
 from test_end_to_end import leave_network, raise_loopback
 from test_web_webcam import ALLOWED, FAKE, found
-from web_case import WEB, browse, bundle, drawn_head, expect_usable, run_node, tasks_vision, until, violations
+from web_case import WEB, browse, bundle, drawn_head, expect_usable, run_node, tasks_vision, until
 
 HOUR = 3600.0
 
@@ -154,29 +153,6 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
             assert each["messages"] == []
             assert all(request.startswith((own, "blob:", "data:")) for request in each["requests"])
     assert (tmp_path / "Ada me.html").read_bytes() == (root / "Ada" / "me.html").read_bytes()
-
-
-def test_a_file_and_a_phone_send_films(tmp_path: Path, test_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The phone's page is on a phone's screen, and its film comes in three pieces while the studio waits for it."""
-    monkeypatch.setattr(server, "address_on_network", lambda: "127.0.0.2")
-    film, large = test_data / "cases" / "plain.mp4", tmp_path / "large.mp4"
-    large.write_bytes(film.read_bytes() + bytes(9 << 20))
-    with studio(tmp_path / "people", lan=True) as serving:
-        serving.maker.people.add("Ada")
-        given = [{"give": ["#file", film]}, {"see": "Turn your head further"}]
-        told_by_page = browse(serving.address, steps=given, fragment="Ada")
-        address = told(serving, "POST", person("Ada", "phone"), {})[1]["url"]
-        pieces: list[int] = []
-        append = serving.maker.people.append
-        monkeypatch.setattr(People, "append", lambda self, *more: pieces.append(len(more[-1])) or append(*more))
-        steps = [{"see": "Film yourself with this phone"}, {"give": ["#file", large]}, {"see": "The film has arrived"}]
-        told_by_phone = browse(address, steps=steps, size=(390, 844), device=("touch", "mobile"))
-        assert [each["messages"] for each in (told_by_page, told_by_phone)] == [[], []]
-        assert [request for request in told_by_phone["requests"] if not request.startswith((address, "data:"))] == []
-        assert [size >> 20 for size in pieces] == [4, 4, 1]
-        assert violations(told(serving, "POST", person("Ada", "phone"), {})[1]["url"], (390, 844), ("touch",)) == []
-        films = told(serving, "GET", person("Ada"))[1]["films"]
-        assert [(each["whole"], each["facts"]["width"]) for each in films] == [(True, 320), (True, 320)]
 
 
 FILMS = """(async () => {

@@ -32,20 +32,20 @@ if TYPE_CHECKING:
     import mien.studio.phone
 
 _MOST_JSON = 16 << 10
-_PAGES = Path(__file__).parent
 _FRAMED = "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"
 """Policy of files: a page from a workspace has no origin, so it can ask the studio for nothing."""
 _STATUS = {
     NotThereError: HTTPStatus.NOT_FOUND, OtherPlaceError: HTTPStatus.CONFLICT,
     FullError: HTTPStatus.INSUFFICIENT_STORAGE, CannotWriteError: HTTPStatus.INSUFFICIENT_STORAGE,
 }  # fmt: skip
+_landmarker_files = cache(webcam_files)
 Answering = Callable[[Request], Awaitable[Response]]
 
 
 @cache
 def page(name: str) -> tuple[bytes, str]:
     """A page of the studio, built from web/, and its policy: it loads nothing, and runs its own script alone."""
-    text = (_PAGES / name).read_text(encoding="utf-8")
+    text = (Path(__file__).parent / name).read_text(encoding="utf-8")
 
     def allowed(tag: str) -> str:
         inside = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
@@ -112,10 +112,7 @@ async def append(request: Request, people: People, name: str, film: str) -> Resp
 
 
 def does(act: Callable[..., Any], reads: bool = False) -> Answering:
-    """An answer that calls a function with what the path names, in a thread, and sends what it returns as json.
-
-    A POST has to bring json, which no form of another page can send. With `reads`, the function gets it as `content`.
-    """
+    """An answer that calls a function with what the path names. A POST brings json, which is `content` with `reads`."""
 
     async def doing(request: Request) -> Response:
         content = await json_of(request) if request.method == "POST" else {}
@@ -154,8 +151,8 @@ class Studio:
             ("GET", f"{person}/face", sends(lambda name: people.folder(name) / "face.jpg")),
             ("PUT", f"{person}/face", self._set_face),
             ("POST", f"{person}/films", does(self._begin_film, reads=True)),
-            ("PUT", film, self._append), ("POST", film, does(people.finish_film)),
-            ("DELETE", film, does(people.remove_film)), ("GET", film, sends(people.film)),
+            ("PUT", film, self._append), ("POST", film, does(self._end_film, reads=True)),
+            ("DELETE", film, does(self._end_film)), ("GET", film, sends(people.film)),
             ("POST", f"{person}/making", does(self._make, reads=True)),
             ("DELETE", f"{person}/making", does(maker.drop)), ("GET", f"{person}/growing", sends(maker.growing)),
             ("GET", f"{person}/fit", sends(lambda name: people.folder(name) / "tracking_preview.html")),
@@ -179,13 +176,11 @@ class Studio:
 
     def _add(self, content: Mapping[str, Any]) -> dict[str, str]:
         """Add a person, who must have agreed."""
-        name = content.get("name")
         if content.get("agreed") is not True:
             raise UserError("the person has to agree before the first recording; ask, and confirm it")
-        if not isinstance(name, str):
-            raise UserError("the request has no name; give one")
-        self.people.add(name.strip())
-        return {"name": name.strip()}
+        name = given.strip() if isinstance(given := content.get("name"), str) else ""
+        self.people.add(name)
+        return {"name": name}
 
     def _remove(self, name: str) -> None:
         """Remove a person with everything."""
@@ -204,6 +199,14 @@ class Studio:
 
     async def _append(self, request: Request) -> Response:
         return await append(request, self.people, request.path_params["name"], request.path_params["film"])
+
+    def _end_film(self, name: str, film: str, content: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
+        """Finish a film, or remove it without `content`. A phone that was sending it sends no more."""
+        remove, finish = self.people.remove_film, self.people.finish_film
+        facts = remove(name, film) if content is None else finish(name, film, content.get("cut") is True)
+        if self.phones is not None:
+            self.phones.end(name, film)
+        return facts
 
     def _make(self, name: str, content: Mapping[str, Any]) -> None:
         self.maker.add(name, Settings.of(content))
@@ -246,7 +249,7 @@ class Studio:
             **self._short(name), "takings": takings, "settings": noted.get("settings", asdict(Settings())),
             "films": [{**asdict(film), "facts": dict(film.facts)} for film in self.people.films(name)],
             "growing": _changed(self.maker.growing(name)), "fit": _changed(folder / "tracking_preview.html"),
-            "advice": advice_for(folder / "me.mien") if run is not None else [],
+            "advice": advice_for(folder / "me.mien", run) if run is not None else [],
             "phone": None if self.phones is None else self.phones.state(name),
         }  # fmt: skip
 
@@ -254,9 +257,6 @@ class Studio:
 def _changed(path: Path) -> int | None:
     """When a file changed, as a mark for the page; None if it is missing."""
     return path.stat().st_mtime_ns if path.is_file() else None
-
-
-_landmarker_files = cache(webcam_files)
 
 
 async def _landmarker(request: Request) -> Response:

@@ -77,10 +77,7 @@ class _Pace:
     """How fast the work of an attempt goes."""
 
     def __init__(self, quality: str, usual: float | None, began: tuple[float, float] | None) -> None:
-        """Begin an attempt. `usual` is how long the whole work took on this machine; None if nothing was made yet.
-
-        `began` is when it began, and how much was done by then, 0 to 1; None if the first look has to tell that.
-        """
+        """Begin an attempt. `usual` has the seconds of all work; `began` when it began, and the share done by then."""
         self._usual = usual
         self._shares = {**_SHARES, "training": _TRAININGS.get(quality, _SHARES["training"])}
         self._began = began
@@ -225,7 +222,9 @@ class Maker:
         began = None if self._printed else (time.monotonic(), 0.0)  # an earlier attempt has done a part
         self._pace = _Pace(settings.quality, self._usual(settings.quality), began)
         state = attempt(self.batch.root, self._program, settings.threads or None, row)
-        if self._ended or not self._is_next(row):
+        with self._change:
+            is_next = any(each is row for each in self._queue[:1])
+        if self._ended or not is_next:
             return  # stopped by the end of the studio, or by a person
         if state is None:
             time.sleep(1.0)  # the process of a studio that was killed is about to end
@@ -233,10 +232,6 @@ class Maker:
         if state.status == "done" and not settings.keep_film:
             self.people.drop_footage(row.name)
         self._conclude(row, state)
-
-    def _is_next(self, row: Row) -> bool:
-        with self._change:
-            return bool(self._queue) and self._queue[0] is row
 
     def _conclude(self, row: Row, state: State | None) -> None:
         """Take a row that has ended out of the queue."""

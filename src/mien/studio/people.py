@@ -174,10 +174,12 @@ class People:
             raise cannot_write(part, error) from None
         return at + len(piece)
 
-    def finish_film(self, name: str, film: str) -> dict[str, Any]:
-        """End a film that was begun, and return its facts. What is no film is removed, with the reason."""
+    def finish_film(self, name: str, film: str, cut: bool = False) -> dict[str, Any]:
+        """End a film that was begun, and return its facts. What is no film is removed, unless it was cut."""
         part = self._part_of(name, film)
         facts = _probed(part)
+        if facts is None and cut:
+            raise UserError(f"{film}: its end has not come, so it cannot be read; send it again, or remove it")
         try:
             if facts is None:
                 part.unlink(missing_ok=True)

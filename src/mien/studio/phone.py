@@ -32,6 +32,8 @@ class Invitation:
     token: str
     film: str | None = None
     """Its name, once it has begun."""
+    sent_as: tuple[str, int] = ("", -1)
+    """The ending and the size in bytes by which a phone that comes back knows it; the size is -1 if none was told."""
     done: bool = False
 
 
@@ -45,24 +47,26 @@ class Phones:
         self._change = threading.Lock()
 
     def invite(self, name: str) -> dict[str, str]:
-        """Invite a phone, and return the address and its QR code as svg. An earlier invitation of the person ends."""
-        invited = Invitation(name, secrets.token_urlsafe(18))
+        """Invite a phone, and return the address and its QR code as svg. They stay the same while a film comes."""
         with self._change:
-            self._invited[name] = invited
+            invited = self._invited.get(name)
+            if invited is None or invited.done or invited.film is None:
+                self._invited[name] = invited = Invitation(name, secrets.token_urlsafe(18))
         url = f"{self.address}/{invited.token}/"
-        code = segno.make(url, error="m").svg_inline(scale=6, border=4, dark="#000", light="#fff")
-        return {"url": url, "svg": code}
+        return {"url": url, "svg": segno.make(url, error="m").svg_inline(scale=6, border=4, dark="#000", light="#fff")}
 
-    def end(self, name: str) -> None:
-        """End the invitation of a person."""
+    def end(self, name: str, film: str | None = None) -> None:
+        """End the invitation of a person; with `film`, only the one by which that film comes."""
         with self._change:
-            self._invited.pop(name, None)
+            invited = self._invited.get(name)
+            if invited is not None and film in (None, invited.film):
+                del self._invited[name]
 
     def state(self, name: str) -> dict[str, Any] | None:
         """Whether a phone is invited to film a person, and how far its film is; None without an invitation."""
         with self._change:
             invited = self._invited.get(name)
-        return None if invited is None else {"film": invited.film, "done": invited.done}
+        return invited and {"film": invited.film, "size": invited.sent_as[1], "done": invited.done}
 
     def app(self) -> Starlette:
         """The answers to phones."""
@@ -82,30 +86,42 @@ class Phones:
                     return invited
         raise NotThereError("this address has ended; ask for a new code in the studio")
 
+    def _sending(self, request: Request) -> tuple[Invitation, str]:
+        invited = self._invitation(request)
+        if invited.film is None:
+            raise UserError("the film has not begun; begin it first")
+        return invited, invited.film
+
     async def _page(self, request: Request) -> Response:
         self._invitation(request)
         return page_response("phone.html")
 
     async def _begin(self, request: Request) -> Response:
-        invited, ending = self._invitation(request), str((await json_of(request)).get("ending", ""))
-        if invited.film is not None:  # the phone has lost its connection, and begins anew
-            with suppress(NotThereError):
-                await run_in_threadpool(self.people.remove_film, invited.name, invited.film)
-        invited.film = await run_in_threadpool(self.people.begin_film, invited.name, ending)
-        return JSONResponse({})
+        """Begin a film, or go on with the same one, and tell how many of its bytes are here."""
+        invited, content = self._invitation(request), await json_of(request)
+        ending, size = str(content.get("ending", "")), content.get("size")
+        sent_as = (ending, size if isinstance(size, int) else -1)
+        return JSONResponse({"at": await run_in_threadpool(self._begun, invited, sent_as)})
+
+    def _begun(self, invited: Invitation, sent_as: tuple[str, int]) -> int:
+        """The bytes that are here of a film that a phone begins, or goes on with after it had gone away."""
+        films = {film.name: film.size for film in self.people.films(invited.name) if not film.whole}
+        if invited.film in films and invited.sent_as == sent_as and sent_as[1] != -1:
+            return films[invited.film]
+        earlier, invited.film = invited.film, self.people.begin_film(invited.name, sent_as[0])
+        invited.sent_as = sent_as
+        if earlier in films:  # the phone sends another film in its place
+            self.people.remove_film(invited.name, earlier)
+        return 0
 
     async def _append(self, request: Request) -> Response:
-        invited = self._invitation(request)
-        if invited.film is None:
-            raise UserError("the film has not begun; begin it first")
-        return await append(request, self.people, invited.name, invited.film)
+        invited, film = self._sending(request)
+        return await append(request, self.people, invited.name, film)
 
     async def _done(self, request: Request) -> Response:
-        invited = self._invitation(request)
+        invited, film = self._sending(request)
         await json_of(request)
-        if invited.film is None:
-            raise UserError("the film has not begun; begin it first")
-        facts = await run_in_threadpool(self.people.finish_film, invited.name, invited.film)
+        facts = await run_in_threadpool(self.people.finish_film, invited.name, film)
         invited.done = True
         return JSONResponse(facts)
 

@@ -47,7 +47,8 @@ export interface Whole extends Short {
   growing: number | null;
   fit: number | null;
   advice: string[];
-  phone: { film: string | null; done: boolean } | null;
+  /** `size` is that of the whole film; -1 if the phone has not told it. */
+  phone: { film: string | null; size: number; done: boolean } | null;
 }
 
 export interface Listed {
@@ -97,8 +98,11 @@ export class Sending {
     return [new Sending((at) => `${person(name, "films", film)}?at=${at}`), film];
   }
 
-  static at(address: (at: number) => string): Sending {
-    return new Sending(address);
+  /** Sends what follows the bytes that are there. */
+  static at(address: (at: number) => string, sent = 0): Sending {
+    const sending = new Sending(address);
+    sending.sent = sent;
+    return sending;
   }
 
   /** Sends what follows what was sent before. */

@@ -23,6 +23,8 @@ export async function busy(which: HTMLButtonElement, act: () => unknown): Promis
   which.disabled = true;
   await attempt(act);
   which.disabled = false;
+  // A button that cannot be pressed loses the focus.
+  if (document.activeElement === document.body) which.focus();
 }
 
 let clearing = 0;
@@ -58,4 +60,14 @@ export function duration(seconds: number): string {
   const minutes = Math.round(seconds / 60);
   if (minutes < 90) return minutes <= 1 ? "a minute" : `${minutes} minutes`;
   return `${Math.round(seconds / 3600)} hours`;
+}
+
+/** Asks a question that “Delete” answers with yes. */
+export function sure(title: string, text: string): Promise<boolean> {
+  const dialog = find<HTMLDialogElement>("sure");
+  find("sure-title").textContent = title;
+  find("sure-words").textContent = text;
+  dialog.returnValue = "no";
+  dialog.showModal();
+  return new Promise((done) => dialog.addEventListener("close", () => done(dialog.returnValue === "yes"), { once: true }));
 }
