@@ -132,8 +132,8 @@ def sums(first: Sequence[Tensor], second: Sequence[Tensor]) -> list[Tensor]:
     if not is_native(*first, *second) or any(tensor.dtype != torch.float32 for tensor in first):
         return [a + b for a, b in zip(first, second, strict=True)]
     found = [recycled_like(tensor) for tensor in first]
-    arrays = ([tensor.contiguous() for tensor in own] for own in (first, second))
-    _native.add_arrays(*(unpacked(*own) for own in arrays), unpacked(*found))
+    one, other = ([tensor.contiguous() for tensor in own] for own in (first, second))
+    _native.add_arrays(unpacked(*one), unpacked(*other), unpacked(*found))
     return found
 
 

@@ -74,7 +74,7 @@ class _Trained:
         derivatives = [own_derivative(loss) for loss in losses.values()]
         derivatives += [_share(count, loss.dtype, loss.device) for loss in regularizers.values()]
         roots = [*losses.values(), *regularizers.values()]
-        found = list(torch.autograd.grad(roots, inputs, derivatives, allow_unused=True))
+        found: list[Tensor | None] = [*torch.autograd.grad(roots, inputs, derivatives, allow_unused=True)]
         if offset is not None:
             offset.grad = found.pop()
         return found, [own.take() for own in self.factored]
