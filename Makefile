@@ -151,8 +151,8 @@ mutate: setup web-packages
 
 # pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup
-	$(BIN)/ruff check src tests examples benchmarks release docs/site docs/pictures
-	$(BIN)/ruff format --check src tests examples benchmarks release docs/site docs/pictures
+	$(BIN)/ruff check src tests examples benchmarks release docs/site docs/pictures web/conformance
+	$(BIN)/ruff format --check src tests examples benchmarks release docs/site docs/pictures web/conformance
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/python tests/sizes.py
 	$(BIN)/python tests/rooms.py mien
@@ -162,8 +162,8 @@ lint: setup
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
-	$(BIN)/ruff check --fix src tests examples benchmarks release docs/site docs/pictures
-	$(BIN)/ruff format src tests examples benchmarks release docs/site docs/pictures
+	$(BIN)/ruff check --fix src tests examples benchmarks release docs/site docs/pictures web/conformance
+	$(BIN)/ruff format src tests examples benchmarks release docs/site docs/pictures web/conformance
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # The site of the documentation, with the reference of the public API: build/docs/index.html. A broken link is an error.

@@ -1,8 +1,9 @@
 // Builds dist/ (the package), and src/mien/formats/shared/page.html, webgpu.js, webcam.html and microphone.html (the page that
 // `mien export` fills, and what --webgpu, --webcam and --microphone put into it), and the pages of src/mien/studio. They are committed, so that the Python package needs no node. `node build.mjs FOLDER` writes all into FOLDER instead.
+import asc from "assemblyscript/asc";
 import { build, transform } from "esbuild";
 import { mkdir, readFile, writeFile } from "node:fs/promises";
-import { dirname, join } from "node:path";
+import { basename, dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 import { gzipSync } from "node:zlib";
 import { minify } from "terser";
@@ -28,13 +29,31 @@ const shaders = {
       loader: "ts",
     })),
 };
+/** A module of WebAssembly, compiled from AssemblyScript: src/NAME.wasm is made of wasm/NAME.ts. */
+const compiled = {
+  name: "compiled",
+  setup: (on) => {
+    on.onResolve({ filter: /\.wasm$/ }, ({ path }) => ({ path: join(here, "wasm", basename(path, ".wasm") + ".ts"), namespace: "wasm" }));
+    on.onLoad({ filter: /.*/, namespace: "wasm" }, async ({ path }) => {
+      let contents;
+      const flags = ["-O3", "--noAssert", "--runtime", "stub", "--enable", "simd", "--importMemory"];
+      const { error, stderr } = await asc.main([basename(path), "-o", "out.wasm", ...flags], {
+        readFile: (name) => readFile(join(dirname(path), name), "utf8").catch(() => null),
+        writeFile: (name, data) => (contents = data),
+        listFiles: () => [],
+      });
+      if (error) throw new Error(stderr.toString());
+      return { contents, loader: "binary" };
+    });
+  },
+};
 /** Files of the package that others import, instead of a copy of their own. */
 const apart = {
   name: "apart",
   setup: (on) => on.onResolve({ filter: /^\.\/(index|gaussians)$/ }, ({ path }) => ({ path: path === "./index" ? "./mien.js" : `${path}.js`, external: true })),
 };
 const bundle = async (entry, format, define = {}, plugins = []) => {
-  const result = await build({ ...options, plugins: [shaders, ...plugins], entryPoints: [entry], format, define: { PRESETS: presets, ...define } });
+  const result = await build({ ...options, plugins: [shaders, compiled, ...plugins], entryPoints: [entry], format, define: { PRESETS: presets, ...define } });
   // esbuild bundles; terser makes what it bundles smaller still: 3 % of a page.
   const { code } = await minify(result.outputFiles[0].text, { ecma: 2020, module: format === "esm", compress: { passes: 3 }, mangle: true, format: { ascii_only: true } });
   return code.trimEnd();

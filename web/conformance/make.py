@@ -40,7 +40,8 @@ BOXES = {"before": ((0.05, -0.05, 0.22), 0.05), "behind": ((-0.07, 0.06, -0.2), 
 BOX_COLOR = (0.1, 0.2, 0.8)
 FACES = (
     {}, {"smile": 1}, {"jawOpen": 0.8}, {"eyeBlinkLeft": 1}, {"surprise": 1}, {"anger": 0.8}, {"mouthPucker": 0.9},
-    {"browInnerUp": 1, "eyeLookUpLeft": 1, "eyeLookUpRight": 1}, {"laugh": 1}, {"eyeLookOutLeft": 1, "eyeLookInRight": 1},
+    {"browInnerUp": 1, "eyeLookUpLeft": 1, "eyeLookUpRight": 1}, {"laugh": 1},
+    {"eyeLookOutLeft": 1, "eyeLookInRight": 1},
 )  # fmt: skip
 
 
@@ -54,7 +55,7 @@ def drawn_person(hair: str, seed: int, count: int) -> runtime.PortableAvatar:
     """Return a drawn person with `count` Gaussians, of which a third are hair."""
     recipe = SyntheticRecipe(hair=hair, glasses=False, clothes=False, texture_size=512)  # type: ignore[arg-type]
     scene, random = SyntheticScene(recipe, seed), np.random.default_rng(seed)
-    subject, anatomy = scene.subject, scene.subject.anatomy
+    subject = scene.subject
     rest = replace(subject.model.neutral(1), identity=scene.identity)
     camera = camera_from_fov(
         math.radians(FOV), 512, 512, look_at(torch.tensor(VIEWS[0]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
@@ -161,6 +162,7 @@ def changes_of(portable: runtime.PortableAvatar, count: int, random: np.random.G
 
 
 def camera_at(eye: tuple[float, float, float], side: int) -> runtime.Camera:
+    """Return the camera at a place of the scene that looks at the target."""
     made = camera_from_fov(
         math.radians(FOV), side, side, look_at(torch.tensor(eye), torch.tensor(TARGET), torch.tensor([0.0, 1, 0]))
     )
@@ -177,6 +179,7 @@ def placed(posed: runtime.Gaussians, place: tuple[float, float, float] = (0, 0, 
 
 
 def both(first: runtime.Gaussians, second: runtime.Gaussians) -> runtime.Gaussians:
+    """Return the Gaussians of two heads as one."""
     parts = {
         name: np.concatenate([part, getattr(second, name)])
         for name, part in vars(first).items()
@@ -186,12 +189,14 @@ def both(first: runtime.Gaussians, second: runtime.Gaussians) -> runtime.Gaussia
 
 
 def write_picture(path: Path, image: np.ndarray) -> str:
+    """Write colours or alphas of 0 to 1, and return the file's name."""
     pixels = (255 * image.clip(0, 1) + 0.5).astype(np.uint8)
     cv2.imwrite(str(path), pixels if pixels.ndim == 2 else pixels[..., ::-1])
     return path.name
 
 
 def main() -> None:
+    """Write the set that the command line asks for."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--gaussians", type=int, default=40_000)

@@ -28,3 +28,8 @@ declare module "three/addons/objects/GaussianSplat.js" {
 declare module "three/addons/utils/GaussianSplatUtils.js" {
   export function createGaussianSplatGeometry(centres: Float32Array, covariances: Float32Array, colors: Uint8ClampedArray): any;
 }
+
+declare module "*.wasm" {
+  const bytes: Uint8Array<ArrayBuffer>;
+  export default bytes;
+}

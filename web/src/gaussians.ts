@@ -1,9 +1,11 @@
 // Posed Gaussians as arrays, for engines that draw them among other objects: mien-web/three, spark, playcanvas and babylon.
 
 import { copyFace, motionFace, motionLength, Poser, setNamed, type Avatar, type Face, type Motion } from "./index";
+import { SimdPosing } from "./simd";
 import { chained, moved, rigid, rotationMatrix, transposed } from "./rigid";
 
 const SH_C0 = 0.28209479177387814;
+const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
 
 /** Arrays that a pose fills, each with a row for each Gaussian. The caller owns them, and leaves out what it does not need. */
 export interface Gaussians {
@@ -86,8 +88,11 @@ export class GaussianSource {
   private readonly shapes: Float32Array;
   private readonly colors: Float32Array;
   private colored = false;
+  /** What poses bound Gaussians; null where it cannot. */
+  private readonly simd: SimdPosing | null;
 
-  constructor(readonly avatar: Avatar) {
+  /** `simd` may be false for posing without WebAssembly, which is slower. */
+  constructor(readonly avatar: Avatar, simd = true) {
     const { attributes } = avatar.baked, poser = (this.poser = new Poser(avatar.baked)), n = (this.count = attributes.opacity_logits.length);
     this.viewDependent = attributes.sh.length > 3 * n;
     this.used = Int32Array.from(new Set(poser.faceIndex));
@@ -96,22 +101,33 @@ export class GaussianSource {
     this.sizes = new Float32Array(poser.frames.length / 12);
     [this.quats, this.scales, this.shapes, this.colors] = [4, 3, 6, 4].map((width) => new Float32Array(width * n));
     this.shape(attributes.quats, attributes.log_scales.map(Math.exp));
+    this.simd = simd ? SimdPosing.on(poser, { quats: this.quats, scales: this.scales, covariances: this.shapes }, this.least) : null;
+    if (this.simd) poser.binds = false;
+  }
+
+  /** The smallest value of a colour, before the view is known. */
+  private get least(): number {
+    return this.viewDependent ? -Infinity : 0;
   }
 
   /** Fills the arrays with the Gaussians of a face. */
   pose(face: Face, into: Gaussians, { first = 0, transform, eye }: Place = {}): void {
-    const { poser } = this, { free } = poser;
+    const { poser, simd } = this, { free } = poser;
     poser.pose(face);
-    if (free) this.shape(free.quats, free.scales);
-    if (poser.changed || !this.colored) this.color();
-    this.place(transform);
-    if (into.centres) this.writeCentres(into.centres, 3 * first);
-    if (into.covariances) this.writeCovariances(into.covariances, 6 * first);
-    if (into.rotations) this.writeRotations(into.rotations, 4 * first);
-    if (into.scales) this.writeScales(into.scales, 3 * first);
-    if (!into.colors) return;
-    into.colors.set(this.colors, 4 * first);
-    if (this.viewDependent && eye) this.addView(face, into.colors, 4 * first, eye, transform);
+    if (simd) {
+      simd.pose(poser, transform ?? IDENTITY, (name) => !!into[name]);
+      for (const [name, values] of Object.entries(simd.results)) into[name as keyof Gaussians]?.set(values, (first * values.length) / this.count);
+    } else {
+      if (free) this.shape(free.quats, free.scales);
+      if (poser.changed || !this.colored) this.color();
+      this.place(transform);
+      if (into.centres) this.writeCentres(into.centres, 3 * first);
+      if (into.covariances) this.writeCovariances(into.covariances, 6 * first);
+      if (into.rotations) this.writeRotations(into.rotations, 4 * first);
+      if (into.scales) this.writeScales(into.scales, 3 * first);
+      into.colors?.set(this.colors, 4 * first);
+    }
+    if (into.colors && this.viewDependent) this.addView(face, into.colors, 4 * first, eye, transform);
   }
 
   /** Takes rotations w x y z of any length, and standard deviations. */
@@ -133,11 +149,11 @@ export class GaussianSource {
   }
 
   private color(): void {
-    const { colors, poser, count } = this, { colors: first, opacityLogits } = poser;
+    const { colors, poser, count, least } = this, { colors: first, opacityLogits } = poser;
     for (let i = 0, c = 0, o = 0; i < count; ++i, c += 3, o += 4) {
-      colors[o] = Math.max(0.5 + SH_C0 * first[c], 0);
-      colors[o + 1] = Math.max(0.5 + SH_C0 * first[c + 1], 0);
-      colors[o + 2] = Math.max(0.5 + SH_C0 * first[c + 2], 0);
+      colors[o] = Math.max(0.5 + SH_C0 * first[c], least);
+      colors[o + 1] = Math.max(0.5 + SH_C0 * first[c + 1], least);
+      colors[o + 2] = Math.max(0.5 + SH_C0 * first[c + 2], least);
       colors[o + 3] = 1 / (1 + Math.exp(-opacityLogits[i]));
     }
     this.colored = true;
@@ -220,20 +236,22 @@ export class GaussianSource {
     return Math.sqrt(frames[f] ** 2 + frames[f + 4] ** 2 + frames[f + 8] ** 2);
   }
 
-  /** Colours as they are seen from the eye. */
-  private addView(face: Face, out: Float32Array, to: number, eye: ArrayLike<number>, transform?: ArrayLike<number> | null): void {
-    const { frames, count } = this, { means, faceIndex, colors, bound } = this.poser, { sh } = this.avatar.baked.attributes, values = new Float64Array(15);
-    const m = transform ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], rest = sh.length / 3 / count - 1;
-    const R = bound?.sh_frame === "world" ? rotationMatrix(face.head_rotation, 0) : [1, 0, 0, 0, 1, 0, 0, 0, 1];
+  /** Adds what the view changes to colours. Without an eye, they are left as they are from no side. */
+  private addView(face: Face, out: Float32Array, to: number, eye?: ArrayLike<number> | null, transform?: ArrayLike<number> | null): void {
+    const { count, simd } = this, { bound } = this.poser, { sh } = this.avatar.baked.attributes, values = new Float64Array(15);
+    const m = transform ?? IDENTITY, rest = sh.length / 3 / count - 1, R = bound?.sh_frame === "world" ? rotationMatrix(face.head_rotation, 0) : [1, 0, 0, 0, 1, 0, 0, 0, 1];
+    const centres = simd ? simd.results.centres : new Float32Array(3 * count);
+    if (!simd) this.writeCentres(centres, 0);
     for (let i = 0, p = 0, o = to; i < count; ++i, p += 3, o += 4) {
-      const f = 12 * faceIndex[i], along = (row: number) => frames[row] * means[p] + frames[row + 1] * means[p + 1] + frames[row + 2] * means[p + 2] + frames[row + 3];
-      const x = along(f) - eye[0], y = along(f + 4) - eye[1], z = along(f + 8) - eye[2];
-      const head = [m[0] * x + m[1] * y + m[2] * z, m[4] * x + m[5] * y + m[6] * z, m[8] * x + m[9] * y + m[10] * z];
-      const length = Math.hypot(head[0], head[1], head[2]) || 1;
-      const turned = [0, 3, 6].map((row) => (R[row] * head[0] + R[row + 1] * head[1] + R[row + 2] * head[2]) / length);
-      harmonics(turned[0], turned[1], turned[2], values);
+      if (eye) {
+        const x = centres[p] - eye[0], y = centres[p + 1] - eye[1], z = centres[p + 2] - eye[2];
+        const head = [m[0] * x + m[1] * y + m[2] * z, m[4] * x + m[5] * y + m[6] * z, m[8] * x + m[9] * y + m[10] * z];
+        const length = Math.hypot(head[0], head[1], head[2]) || 1;
+        const turned = [0, 3, 6].map((row) => (R[row] * head[0] + R[row + 1] * head[1] + R[row + 2] * head[2]) / length);
+        harmonics(turned[0], turned[1], turned[2], values);
+      }
       for (let channel = 0; channel < 3; ++channel) {
-        let sum = 0.5 + SH_C0 * colors[p + channel];
+        let sum = out[o + channel];
         for (let k = 0, s = 3 * (i * (rest + 1) + 1) + channel; k < rest; ++k, s += 3) sum += values[k] * sh[s];
         out[o + channel] = Math.max(sum, 0);
       }
