@@ -23,10 +23,12 @@ from mien import runtime, tracking
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.cli import COMMANDS, main
 from mien.face.loading import add_face_model
+from mien.formats.glb import write_glb
 from mien.media.video import probe_video
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 from needs import NO_NAMESPACE
 from shared_things import write_toy_workspace
+from test_glb import mesh_model
 from toy_scene import toy_face_model
 from viewer_alone import page_of
 from web_case import chromium, drawn_head, violations
@@ -90,6 +92,7 @@ OF_A_RUN = {
     "drive": "{toy} --run toy --by {toy} --out {out}/driven.mp4", "export": "{demo} --out {out}/me.html",
     "export-dataset": "{toy} --out {out}/data --format insta", "import": "{exported} --out {out}/imported",
     "face-models": "--json", "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
+    "check": "{glb}",
 }  # fmt: skip
 """Lines of every command but three: `demo` makes the subject, and `studio` and `view` have tests of their own."""
 _FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
@@ -125,7 +128,9 @@ def test_no_command_needs_a_network_once_there_is_a_run(offline, fork_server, tm
     add_face_model(toy_face_model(), tmp_path / "toy.npz", "none")
     lines = {"export": "{toy} --out {exported} --format gaussian-avatars"}
     run_all(fork_server, lines, toy=toy, exported=exported)
-    run_all(fork_server, OF_A_RUN, demo=offline, toy=toy, exported=exported, out=tmp_path)
+    write_glb(tmp_path / "me.glb", drawn_head(50), mesh_model(drawn_head(50)), 32)
+    given = {"demo": offline, "toy": toy, "exported": exported, "out": tmp_path, "glb": tmp_path / "me.glb"}
+    run_all(fork_server, OF_A_RUN, **given)
     runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
     viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
     assert viewer.wait() == 0, viewer.stderr

@@ -49,6 +49,7 @@ GROUPS = {
         "face-models": "list the face models and bake them ahead of time",
         "licenses": "what is installed, under which terms, and what that means",
         "plugins": "what other packages add: methods, formats and datasets, and their faults",
+        "check": "a .glb file with an avatar -> its mistakes against docs/spec, a line each",
     },
 }
 """The sub-commands with their summaries, as `mien --help` lists them.
