@@ -25,5 +25,6 @@ class Command:
         for fault in faults:
             show(fault)
         if faults:
-            raise UserError(f"{self.file}: has {counted(len(faults), 'mistake')}; docs/spec/README.md says what is expected")
+            found = counted(len(faults), "mistake")
+            raise UserError(f"{self.file}: has {found}; docs/spec/README.md says what is expected")
         show(f"{self.file}: follows docs/spec/README.md")
