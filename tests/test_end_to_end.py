@@ -239,7 +239,7 @@ def test_api_page(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert "Gaussians" in capsys.readouterr().out
 
 
-DEMO = ("--seconds", "0.8", "--steps", "60")
+DEMO = ("--seconds", "0.8", "--steps", "120")
 FRAMES = 12
 """Number of frames of the clip."""
 VIDEO = "synthetic-0-0.8s.mp4"

@@ -18,7 +18,7 @@ from mien import runtime
 from mien.disk.files import check_writable
 from mien.driving.motion import ARKIT_NAMES
 from mien.errors import UserError
-from mien.formats.format import NoOptions
+from mien.formats.format import Content, NoOptions
 from mien.formats.shared.glb_file import INDICES, VERTICES, Glb, GlbWriter, read_glb
 from mien.formats.shared.splats import unit_quats
 from mien.machine import exact
@@ -373,3 +373,12 @@ def _tensor(glb: Glb, described: dict[str, Any]) -> np.ndarray:
     if len(data) != 4 * math.prod(shape):
         raise ValueError(f"its shape {shape} needs {4 * math.prod(shape)} bytes, and its bufferView has {len(data)}")
     return np.frombuffer(data, _KINDS[kind]).reshape(shape).copy()
+
+
+def write(path: Path, content: Content, options: GlbOptions) -> str:
+    """Write the file, and return what is told of it."""
+    mesh = content.mesh()
+    targets = write_glb(path, content.portable(), mesh, mesh_only=options.mesh_only)
+    splats = "" if options.mesh_only else f"{content.count:,} Gaussians at rest, "
+    joints = len(mesh.rig.joint_names)
+    return f"a mesh with {len(targets)} morph targets and {joints} joints, {splats}{path.stat().st_size / 1e6:.1f} MB"
