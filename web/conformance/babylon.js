@@ -43,12 +43,12 @@ export async function open(canvas, background) {
       camera.position.set(...eye);
       camera.setTarget(new Vector3(...target));
     },
-    /** Draws until the engine's worker has sorted this picture, and returns it as a data address. */
+    /** Draws until the engine has its shaders and its worker has sorted this picture, and returns it as a data address. */
     async draw() {
       camera.computeWorldMatrix(true);
       stage.update(0, camera);
       let shown = "";
-      for (let same = 0, last = ""; same < 3; last = shown) {
+      for (let same = 0, last = ""; same < 3 || !scene.isReady(); last = shown) {
         scene.render();
         shown = canvas.toDataURL();
         await new Promise((done) => setTimeout(done, 100));
