@@ -26,6 +26,8 @@ from test_web_webcam import ALLOWED, FAKE, found
 from web_case import WEB, browse, bundle, drawn_head, expect_usable, run_node, tasks_vision, until
 
 HOUR = 3600.0
+FOUR_SECONDS = r"0:(0[4-9]|[1-5]\d)"
+"""The clock of a film when the guide has seen four seconds. A busy machine may pass a second without showing it."""
 
 GOOD = {"face": 0.5, "around": 0.5, "sharpness": 1.0}
 BOX = [0.35, 0.25, 0.65, 0.75]
@@ -123,14 +125,14 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
         first = [
             {"click": "New person"}, {"fill": ["Who is it?", "Ada"]}, {"click": "This person has agreed"},
             {"click": "Continue"}, {"see": "Half a minute of film is enough."}, {"press": "#film"},
-            {"see": "Put your face into the outline, then record."}, {"press": "#record"}, {"see": "0:04"},
+            {"see": "Put your face into the outline, then record."}, {"press": "#record"}, {"match": FOUR_SECONDS},
         ]  # fmt: skip
         closed = browse(serving.address, steps=first, **asked)
         (unfinished,) = told(serving, "GET", person("Ada"))[1]["films"]
         assert (unfinished["whole"], unfinished["size"] > 10_000) == (False, True), "the tab was closed"
         second = [
             {"see": "Ada"}, {"press": "#people button"}, {"press": '[aria-label="Keep film 1"]'}, {"see": "512×512"},
-            {"press": "#film"}, {"see": "Put your face"}, {"press": "#record"}, {"see": "0:04"}, {"press": "#finish"},
+            {"press": "#film"}, {"see": "Put your face"}, {"press": "#record"}, {"match": FOUR_SECONDS}, {"press": "#finish"},
             {"see": "Film 2"}, {"click": "More"}, {"press": "#quality"}, {"keys": ["Home", "Enter"]},
             {"press": "#make"}, {"see": "Stop"},
         ]  # fmt: skip

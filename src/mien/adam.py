@@ -83,6 +83,10 @@ class FactoredGradient:
             self._of_thread.terms = []
         return self._of_thread.terms
 
+    def __reduce__(self) -> tuple[type["FactoredGradient"], tuple[()]]:
+        """A copy has no terms: those belong to a thread and a step."""
+        return FactoredGradient, ()
+
     def take(self) -> list[FactoredTerm]:
         """Return the terms, and clear them."""
         terms, self._of_thread.terms = self.terms, []

@@ -85,6 +85,7 @@ function actions(tab, width, height, shapes) {
   return {
     wait: (milliseconds) => tab.waitForTimeout(milliseconds),
     see: (text) => tab.getByText(text).first().waitFor(),
+    match: (pattern) => tab.getByText(new RegExp(pattern)).first().waitFor(),
     click: (text) => tab.getByText(text, { exact: true }).first().click(),
     press: (selector) => tab.locator(selector).click(),
     async keys(names) {
