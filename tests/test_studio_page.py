@@ -132,9 +132,9 @@ def test_from_the_first_page_to_the_living_avatar(tmp_path: Path, camera: list[s
         assert (unfinished["whole"], unfinished["size"] > 10_000) == (False, True), "the tab was closed"
         second = [
             {"see": "Ada"}, {"press": "#people button"}, {"press": '[aria-label="Keep film 1"]'}, {"see": "512×512"},
-            {"press": "#film"}, {"see": "Put your face"}, {"press": "#record"}, {"match": FOUR_SECONDS}, {"press": "#finish"},
-            {"see": "Film 2"}, {"click": "More"}, {"press": "#quality"}, {"keys": ["Home", "Enter"]},
-            {"press": "#make"}, {"see": "Stop"},
+            {"press": "#film"}, {"see": "Put your face"}, {"press": "#record"}, {"match": FOUR_SECONDS},
+            {"press": "#finish"}, {"see": "Film 2"}, {"click": "More"}, {"press": "#quality"},
+            {"keys": ["Home", "Enter"]}, {"press": "#make"}, {"see": "Stop"},
         ]  # fmt: skip
         made = browse(serving.address, steps=second, **asked)
         films = told(serving, "GET", person("Ada"))[1]["films"]
