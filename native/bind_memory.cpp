@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "arrays.h"
 #include "memory.h"
 
 namespace nb = nanobind;
@@ -21,7 +22,8 @@ using Shape = std::vector<size_t>;
 
 // The owner of recycled memory for a tensor, and where it begins.
 std::pair<nb::capsule, float*> memory_of(const Shape& shape) {
-  constexpr size_t kMost = SIZE_MAX / 8;
+  constexpr size_t kMost = SIZE_MAX / 8, kMostAxes = 64;
+  require(shape.size() <= kMostAxes, "a tensor has at most 64 axes");
   size_t count = 1;
   for (const size_t length : shape) {
     if (length > kMost || (length != 0 && count > kMost / length)) throw std::bad_alloc();

@@ -163,6 +163,9 @@ def test_memory_is_used_again_but_never_while_somebody_holds_it() -> None:
     del view
     assert recycled(1024, 1025).data_ptr() == address
     assert (recycled(0, 3).shape, recycled(4, 0).shape) == ((0, 3), (4, 0))
+    for many in (_native.recycled, _native.recycled_twice):
+        with pytest.raises(ValueError, match="a tensor has at most 64 axes"):
+            many([1] * 129)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
