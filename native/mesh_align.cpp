@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "mesh_align_surface.h"
+#include "pool.h"
 
 namespace mien {
 namespace {
@@ -287,28 +288,27 @@ void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignF
   camera_position(frame.view.viewmat, eye);
   const MeshView& view = frame.view;
   const float least = options.outlier * options.outlier, inverse_variance = 1 / (options.sigma * options.sigma);
-  const int64_t count = static_cast<int64_t>(surface.texture_width) * surface.texture_height;
-  for (int64_t texel = 0; texel < count; ++texel) {
+  const auto add_texel = [&](int64_t texel) {
     const int32_t face = texels.face[texel];
-    if (face < 0 || !surface.used[face]) continue;
+    if (face < 0 || !surface.used[face]) return;
     const SurfacePoint point =
         surface_point(mesh, frame, eye, mesh.faces + 3 * static_cast<int64_t>(face), texels.barycentric + 3 * texel);
-    if (point.cosine < options.least_cosine) continue;
+    if (point.cosine < options.least_cosine) return;
     float in_camera[3];
     for (int row = 0; row < 3; ++row) {
       const float* m = view.viewmat + 4 * row;
       in_camera[row] = m[0] * point.position[0] + m[1] * point.position[1] + m[2] * point.position[2] + m[3];
     }
-    if (in_camera[2] < kMeshNearPlane) continue;
+    if (in_camera[2] < kMeshNearPlane) return;
     const float x = view.K[0] * in_camera[0] / in_camera[2] + view.K[2] - 0.5f;
     const float y = view.K[4] * in_camera[1] / in_camera[2] + view.K[5] - 0.5f;
-    if (!(x >= 0 && y >= 0 && x < view.width - 1 && y < view.height - 1)) continue;
+    if (!(x >= 0 && y >= 0 && x < view.width - 1 && y < view.height - 1)) return;
     const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
     const int64_t nearest = static_cast<int64_t>(std::lround(y)) * view.width + std::lround(x);
     // The depth that a slope gains within a pixel does not hide it.
     const float slope = std::sqrt(std::max(1 - point.cosine * point.cosine, 0.0f)) / std::max(point.cosine, 0.1f);
     const float tolerance = kDepthTolerance + in_camera[2] / view.K[0] * slope;
-    if (in_camera[2] > drawn.depth[nearest] + tolerance) continue;
+    if (in_camera[2] > drawn.depth[nearest] + tolerance) return;
     float color[3] = {}, mask = 0;
     for (int dy = 0; dy < 2; ++dy) {
       for (int dx = 0; dx < 2; ++dx) {
@@ -335,7 +335,11 @@ void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignF
       out.mixed[3 * texel + c] += weight * light.c[c] * color[c];
       out.image[3 * texel + c] += weight * color[c] * color[c];
     }
-  }
+  };
+  const int64_t columns = surface.texture_width;
+  parallel_for(surface.texture_height, [&](int64_t row) {
+    for (int64_t texel = row * columns; texel < (row + 1) * columns; ++texel) add_texel(texel);
+  });
 }
 
 void light_equations(const Mesh& mesh, const TexturedSurface& surface, const AlignFrame& frame,

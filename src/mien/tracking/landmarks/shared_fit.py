@@ -11,7 +11,7 @@ from torch import Tensor
 from mien.tracking.fitting.fit import Fit, SequenceFit
 from mien.tracking.fitting.solver import join_frames, join_shared, place_shared, solve_arrow
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS
-from mien.tracking.landmarks.term import LandmarkTerm, move_subject
+from mien.tracking.landmarks.term import LandmarkTerm, WeightedLinearization, move_subject
 from mien.tracking.settings import TrackingSettings
 
 _FOCAL_SIGMA = 0.03
@@ -99,8 +99,8 @@ def fit_bias(terms: Sequence[LandmarkTerm], fit: Fit) -> Fit:
     precision[list(LIPS + LEFT_EYELIDS + RIGHT_EYELIDS)] *= _RIM_BIAS_SHARE**-2
     hessian, gradient = precision[..., None] * torch.eye(3).to(bias), precision * (bias - expected)
     for term, sequence in zip(terms, fit.sequences, strict=True):
-        for part in term.linearizations(sequence.state, fit.subject, sequence.cameras):
-            part_hessian, part_gradient = part.bias_equations()
+        parts = term.linearized(WeightedLinearization.bias_equations, sequence.state, fit.subject, sequence.cameras)
+        for part_hessian, part_gradient in parts:
             hessian, gradient = hessian + part_hessian, gradient + part_gradient
     own = bias - torch.linalg.solve(hessian, gradient) - expected
     own[list(LEFT_IRIS + RIGHT_IRIS)] = 0

@@ -1,12 +1,14 @@
 """The landmark cost: robust distances between detected and projected landmarks, with priors on the parameters."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mien.machine.parallel import stream_in_threads
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.fitting.fit import SequenceFit, Subject
 from mien.tracking.fitting.solver import NormalEquations, SharedEquations
@@ -15,6 +17,8 @@ from mien.tracking.landmarks.detector_response import DetectorResponse
 from mien.tracking.landmarks.groups import LEFT_EYELIDS, LEFT_IRIS, LIPS, RIGHT_EYELIDS, RIGHT_IRIS, landmark_weights
 from mien.tracking.landmarks.model import LandmarkModel, Linearization
 from mien.tracking.settings import TrackingSettings
+
+Result = TypeVar("Result")
 
 LANDMARK_SIGMA = 0.0015  # expected error of a landmark, in metres on the face
 _OUTLIER = 6.0  # number of these sigmas beyond which a landmark's pull fades
@@ -27,7 +31,7 @@ cameras in the fit")."""
 
 LINEARIZED = 48
 """Number of pictures linearised at once, which takes about 100 MB of memory."""
-PROJECTED = 512
+PROJECTED = 128
 """Number of pictures projected at once, which takes about as much memory."""
 
 
@@ -92,9 +96,13 @@ class LandmarkTerm:
         self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch
     ) -> Iterator[tuple[Float[Tensor, "m l 2"], Views]]:
         """Yield the offsets from detected to projected landmarks, and their pictures."""
-        for pictures, rows, batch, place in self._batches(PROJECTED, cameras):
+
+        def offsets(part: tuple[Views, Tensor, CameraBatch, Tensor]) -> tuple[Tensor, Views]:
+            pictures, rows, batch, place = part
             projected = self.model.project(state[rows], subject.identity, subject.bias, batch, place)
-            yield projected - pictures.detected, pictures
+            return projected - pictures.detected, pictures
+
+        return stream_in_threads(offsets, self._batches(PROJECTED, cameras))
 
     def cost(self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch) -> Float[Tensor, " v"]:
         """The cost of each timestep."""
@@ -105,14 +113,23 @@ class LandmarkTerm:
         """Distances between detected and projected landmarks in each picture, in pixels."""
         return torch.cat([offsets.norm(dim=-1) for offsets, _ in self._offsets(state, subject, cameras)])
 
-    def linearizations(
-        self, state: Float[Tensor, "v p"], subject: Subject, cameras: CameraBatch, with_identity: bool = False
-    ) -> "Iterator[WeightedLinearization]":
-        """Yield linearisations of all pictures, a bounded number at a time."""
-        for pictures, rows, batch, place in self._batches(LINEARIZED, cameras):
+    def linearized(
+        self,
+        use: "Callable[[WeightedLinearization], Result]",
+        state: Float[Tensor, "v p"],
+        subject: Subject,
+        cameras: CameraBatch,
+        with_identity: bool = False,
+    ) -> Iterator[Result]:
+        """Yield what `use` makes of linearisations of all pictures, a bounded number at a time, each in a thread."""
+
+        def used(part: tuple[Views, Tensor, CameraBatch, Tensor]) -> Result:
+            pictures, rows, batch, place = part
             at = self.model.linearize(state[rows], subject.identity, subject.bias, batch, place, with_identity)
             residual = at.pixels - pictures.detected
-            yield WeightedLinearization(at, pictures.row, residual, *self.robust(residual, pictures))
+            return use(WeightedLinearization(at, pictures.row, residual, *self.robust(residual, pictures)))
+
+        return stream_in_threads(used, self._batches(LINEARIZED, cameras))
 
     def equations(
         self,
@@ -124,10 +141,18 @@ class LandmarkTerm:
         """The normal equations of each timestep on its own. Those of shared parameters are added to `shared`."""
         cost, pull = self._prior(state)
         equations = NormalEquations(cost, pull, self.model.layout.precision.repeat(len(state), 1, 1))
-        for part in self.linearizations(state, subject, cameras, with_identity=shared is not None):
-            part.add_to(equations)
-            if shared is not None:
-                part.add_to_shared(shared)
+
+        def blocks(part: WeightedLinearization) -> tuple[Tensor, NormalEquations, SharedEquations | None]:
+            return part.row, part.equations(), None if shared is None else part.shared_equations()
+
+        for row, own, across in self.linearized(blocks, state, subject, cameras, with_identity=shared is not None):
+            equations.cost.index_add_(0, row, own.cost)
+            equations.gradient.index_add_(0, row, own.gradient)
+            equations.hessian.index_add_(0, row, own.hessian)
+            if shared is not None and across is not None:
+                shared.across.index_add_(0, row, across.across)
+                shared.hessian.add_(across.hessian)
+                shared.gradient.add_(across.gradient)
         return equations
 
     def joint_equations(
@@ -154,23 +179,19 @@ class WeightedLinearization:
     def _weighted(self, derivative: Float[Tensor, "n l 2 s"]) -> Float[Tensor, "n m s"]:
         return (derivative * self.weights.sqrt()[:, :, None, None]).flatten(1, 2)
 
-    def add_to(self, equations: NormalEquations) -> None:
-        """Add cost, half gradient and half Hessian by the timesteps' own parameters, in place."""
+    def equations(self) -> NormalEquations:
+        """Cost, half gradient and half Hessian of each picture by its timestep's own parameters."""
         jacobian = self._weighted(self.at.by_frame)
         gradient = jacobian.mT @ self._weighted(self.residual[..., None])
-        equations.cost.index_add_(0, self.row, self.cost)
-        equations.gradient.index_add_(0, self.row, gradient[..., 0])
-        equations.hessian.index_add_(0, self.row, jacobian.mT @ jacobian)
+        return NormalEquations(self.cost, gradient[..., 0], jacobian.mT @ jacobian)
 
-    def add_to_shared(self, equations: SharedEquations) -> None:
-        """Add the blocks of the shared parameters, in place."""
+    def shared_equations(self) -> SharedEquations:
+        """The blocks of the shared parameters, across those of each picture's timestep."""
         assert self.at.by_shared is not None
         shared = self._weighted(self.at.by_shared)
         own = self._weighted(self.at.by_frame)
         gradient = shared.mT @ self._weighted(self.residual[..., None])
-        equations.across.index_add_(0, self.row, own.mT @ shared)
-        equations.hessian.add_((shared.mT @ shared).sum(0))
-        equations.gradient.add_(gradient[..., 0].sum(0))
+        return SharedEquations(own.mT @ shared, (shared.mT @ shared).sum(0), gradient[..., 0].sum(0))
 
     def bias_equations(self) -> tuple[Float[Tensor, "l 3 3"], Float[Tensor, "l 3"]]:
         """Half Hessian and half gradient of every landmark's bias."""

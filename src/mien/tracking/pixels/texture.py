@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,6 +12,7 @@ from torch import Tensor
 from mien import _native
 from mien.camera import Camera
 from mien.face.model import FaceModel
+from mien.machine.parallel import map_in_threads
 from mien.render.mesh import MeshFragments, rasterize_mesh
 from mien.tracking.fitting.fit import HIDING_REGIONS, Fit, fit_of
 from mien.tracking.pixels.pictures import Picture
@@ -116,7 +118,8 @@ def estimate_appearance(
             texture = replace(texture, albedo=seen[..., None] * median, sigma=_FIRST_SIGMA)
         views = [_relit(space.native(texture, outlier), own) for own in views]
     surface = space.native(texture, outlier)
-    even = [[_without_smooth_residual(surface, view, light_radius) for view in own] for own in views]
+    smoothed = partial(_without_smooth_residual, surface, radius=light_radius)
+    even = [map_in_threads(smoothed, own) for own in views]
     return _bake(space, even, texture, outlier), [own[0].light for own in views]
 
 
@@ -149,9 +152,13 @@ def _bake(
 
 def _relit(surface: "_native.AlignSurface", views: Sequence[SurfaceView]) -> list[SurfaceView]:
     """The views of a sequence with the light that explains them."""
-    hessian, right = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
-    for view in views:
-        _native.light_equations(surface, view.arrays(), hessian, right)
+
+    def equations(view: SurfaceView) -> tuple[Tensor, Tensor]:
+        own = torch.zeros(3, 9, 9).double(), torch.zeros(3, 9).double()
+        _native.light_equations(surface, view.arrays(), *own)
+        return own
+
+    hessian, right = (torch.stack(parts).sum(0) for parts in zip(*map_in_threads(equations, views), strict=True))
     hessian = hessian + hessian.triu(1).mT
     most = hessian.diagonal(dim1=1, dim2=2).amax(1)
     stiffness = _LIGHT_STIFFNESS * most[:, None].expand(3, 9).clone() + 1e-9
