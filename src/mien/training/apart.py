@@ -87,7 +87,10 @@ def _share(count: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor
 
 @contextmanager
 def threads_of_frames(like: Tensor) -> Iterator[Map]:
-    """Threads that end with the block, one for each core, each of which keeps to its own. A GPU has one for all."""
+    """Threads that end with the block, one for each core, each of which keeps to its own. A GPU has one for all.
+
+    Calls that are left over, when each thread had as many as the others, take all cores one after the other.
+    """
     count = _native.thread_count() if like.is_cpu else 1
     if count == 1:
         yield lambda calls: [call() for call in calls]
@@ -100,8 +103,10 @@ def threads_of_frames(like: Tensor) -> Iterator[Map]:
     with ThreadPoolExecutor(count, thread_name_prefix="mien-frames", initializer=begin) as pool:
 
         def together(calls: Items[Callable[[], Part]]) -> list[Part]:
-            waiting = [pool.submit(call) for call in calls]
-            return [one.result() for one in waiting]
+            left = len(calls) % count if len(calls) > count else 0
+            waiting = [pool.submit(call) for call in calls[: len(calls) - left]]
+            found = [one.result() for one in waiting]
+            return found + [call() for call in calls[len(calls) - left :]]
 
         yield together
 
