@@ -165,7 +165,7 @@ def _seen_from_the_front(model: FaceModel, filled_in: torch.Tensor | None = None
     return Unseen(None, prior)
 
 
-def test_contributions_are_the_shares_of_the_picture(anny):
+def test_contributions_are_the_shares_of_the_picture(anny, monkeypatch):
     avatar, (face, camera), back = _closed_avatar(anny)
     found = contributions(avatar, [(face, camera)])
     with torch.no_grad():
@@ -173,7 +173,10 @@ def test_contributions_are_the_shares_of_the_picture(anny):
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
     assert (found >= 0).all()
     behind = replace(face, head_rotation=torch.tensor([[0.0, torch.pi, 0.0]]))
+    monkeypatch.setenv("MIEN_THREADS", "1")
     both = contributions(avatar, [(face, camera), (behind, camera)])
+    monkeypatch.setenv("MIEN_THREADS", "2")
+    assert torch.equal(contributions(avatar, [(behind, camera), (face, camera)]), both)
     assert float(both[back].mean()) > 0.5
     assert (both >= found).all()
 

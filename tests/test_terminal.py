@@ -20,11 +20,13 @@ from forked import ForkServer
 from mien import runtime
 from mien.cli import main
 from mien.disk import reading as bounded
+from mien.disk.workspace import Workspace
+from mien.errors import UserError
 from mien.machine import progress, system
 from mien.machine.progress import current_stage, progress_bar, say, stages
 from mien.machine.terminal import plain_name, printable, show
 from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
-from mien.pipeline import stage_times
+from mien.pipeline import stage_times, track
 from mien.pipeline.stage_times import StageTimes
 from needs import find_test_data
 from refusals import complaint, refuses
@@ -208,6 +210,23 @@ def test_a_slow_first_item_does_not_count_and_the_last_line_comes_once(
             clock.now += seconds
             advance(status=status)
     assert capsys.readouterr().err.splitlines() == [f"Tracking: {each}" for each in told]
+
+
+def test_work_beside_has_no_bar_and_its_error_is_told(monkeypatch, capsys) -> None:
+    """Of two bars, one would spoil the other."""
+
+    def show(*_: object) -> None:
+        with progress_bar("Overlay", 2) as advance:
+            advance(2)
+        say("See report.html")
+        raise UserError("the disk is full")
+
+    monkeypatch.setattr(track, "show_trackings", show)
+    meanwhile = track.showing_meanwhile(Workspace(Path()), [], "auto")
+    with pytest.raises(UserError, match="the disk is full"), meanwhile, progress_bar("training", 1) as advance:
+        advance()
+    told = [line.partition(" in ")[0] for line in capsys.readouterr().err.splitlines()]
+    assert sorted(told) == ["See report.html", "training: 1/1"]
 
 
 OF_PLACES = ("LANG", "LC_ALL", "LC_CTYPE", "PYTHONUTF8", "PYTHONIOENCODING", "HOME", "XDG_CACHE_HOME", "MIEN_THREADS")

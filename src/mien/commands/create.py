@@ -112,7 +112,7 @@ class Command:
         from mien.pipeline.create import name_next_commands, show_film, show_page
         from mien.pipeline.evaluate import run_evaluation_stage
         from mien.pipeline.stage_times import FILE_NAME, StageTimes
-        from mien.pipeline.track import run_tracking_stage, show_trackings
+        from mien.pipeline.track import run_tracking_stage, showing_meanwhile
         from mien.pipeline.train import run_training_stage
         from mien.training.settings import check_held_out
 
@@ -143,11 +143,11 @@ class Command:
             # A run that goes on keeps its tracking.
             if self.aligns(not one) and not is_trained_on(workspace, run, names):
                 run_alignment_stage(workspace, names, self.alignment, settings, keep=True)
-            show_trackings(workspace, list(trackings), self.overlay)
             begin("training")
             published = PRESETS[self.options.preset].published
-            run_training_stage(workspace, names, run, method, settings, self.view, published, self.growing)
-            show_page(workspace, run)
+            with showing_meanwhile(workspace, list(trackings), self.overlay):
+                run_training_stage(workspace, names, run, method, settings, self.view, published, self.growing)
+                show_page(workspace, run)
             if settings.holds_out:
                 begin("scoring")
                 # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.

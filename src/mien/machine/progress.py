@@ -1,9 +1,10 @@
 """Progress bars with an ETA for long work. If the output is no terminal, they print a line now and then."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Protocol, TypeVar, runtime_checkable
 
 from rich.console import Console
@@ -24,6 +25,8 @@ console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 """The console for people, on standard error, so that standard output stays for results."""
 
 _PLAIN_INTERVAL_SECONDS = 10.0
+_beside = threading.local()
+"""Its `work` is true in threads whose work stands beside that which a person waits for."""
 _stage: list[str] = []
 """The name of the stage of the command that runs, if it has said so."""
 
@@ -56,8 +59,15 @@ class Advance(Protocol):
         ...
 
 
+def without_bars() -> None:
+    """Show no bars of the calling thread's work, as another thread has one."""
+    _beside.work = True
+
+
 def progress_bar(title: str, total: int, completed: int = 0) -> AbstractContextManager[Advance]:
     """A bar from `completed` to `total`. If the output is no terminal, it prints a line every ten seconds instead."""
+    if getattr(_beside, "work", False):
+        return nullcontext(lambda amount=1, status="": None)
     return (_bar if sys.stderr.isatty() else _plain_progress)(printable(title), total, completed)
 
 

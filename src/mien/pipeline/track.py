@@ -2,8 +2,9 @@
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
@@ -18,7 +19,7 @@ from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
-from mien.machine.progress import say
+from mien.machine.progress import say, without_bars
 from mien.media.video import count_frames
 from mien.pipeline.face_models import face_model_of
 from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
@@ -105,6 +106,15 @@ def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overla
         for folder in lacking:
             tracking = read_tracking(folder / "tracking")
             show_tracking(folder, tracking, load_face_model(tracking.face_model), overlay)
+
+
+@contextmanager
+def showing_meanwhile(workspace: Workspace, names: Collection[str], overlay: Overlay) -> Iterator[None]:
+    """Run `show_trackings` on a thread beside the block, which ends when both have ended."""
+    with ThreadPoolExecutor(1, thread_name_prefix="mien-reports", initializer=without_bars) as pool:
+        shown = pool.submit(show_trackings, workspace, names, overlay)
+        yield
+    shown.result()
 
 
 def _check_apart(names: Collection[str], hold_out: Collection[str]) -> None:

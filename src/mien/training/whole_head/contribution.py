@@ -18,6 +18,7 @@ from mien.avatar.bound_surface import BoundSurface
 from mien.camera import Camera
 from mien.face.params import FaceParams
 from mien.gaussians import SH_C0
+from mien.machine.parallel import stream_in_threads
 from mien.render import rasterize
 from mien.training.whole_head.unseen import Unseen
 
@@ -33,14 +34,18 @@ def contributions(avatar: Avatar, views: Items[tuple[FaceParams, Camera]]) -> Fl
     equation 3). It is the derivative of the picture by the Gaussian's colour. A view is one timestep and a camera.
     """
     most = torch.zeros(len(avatar.store), device=avatar.face_model.template.device)
-    for face, camera in views:
+
+    @torch.enable_grad()
+    def of_view(view: tuple[FaceParams, Camera]) -> Float[Tensor, " n"]:
         with torch.no_grad():
-            gaussians = avatar.pose(face).gaussians.timestep(0)
+            gaussians = avatar.pose(view[0]).gaussians.timestep(0)
         colors = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
-        picture = rasterize(replace(gaussians, sh=colors), camera, colors.new_zeros(3)).image
-        picture[..., 0].sum().backward()
-        assert colors.grad is not None
-        most = torch.maximum(most, colors.grad[:, 0, 0].to(most) / SH_C0)
+        picture = rasterize(replace(gaussians, sh=colors), view[1], colors.new_zeros(3)).image
+        (found,) = torch.autograd.grad(picture[..., 0].sum(), colors)
+        return found[:, 0, 0].to(most) / SH_C0
+
+    for own in stream_in_threads(of_view, views, None if most.is_cpu else 1):
+        most = torch.maximum(most, own)
     return most
 
 
