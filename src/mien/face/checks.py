@@ -16,9 +16,10 @@ AXES = {
     "expression_basis": "ev3", "expression_bounds": "e2", "joint_template": "k3", "joint_identity_basis": "ik3",
     "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
     "expression_sigmas": "e", "joint_regressor": "kv", "flame_origin": "3",
+    "torso_shares": "k",
 }  # fmt: skip
 """Axes of the tensors of `FaceModel`."""
-_OPTIONAL = ("pose_basis", "expression_sigmas", "joint_regressor", "flame_origin")
+_OPTIONAL = ("pose_basis", "expression_sigmas", "joint_regressor", "flame_origin", "torso_shares")
 _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
 """Axis into which the values of each of these tensors are indices."""
 
@@ -41,7 +42,7 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
     shapes = {
         "identity": (len(model.identity_basis),), "expression": (b, len(model.expression_basis)),
         "joints": (b, len(model.free_joint_names), 3), "head_rotation": (b, 3), "head_translation": (b, 3),
-        "vertex_offsets": (v, 3),
+        "vertex_offsets": (v, 3), "torso_rotation": (b, 3), "torso_translation": (b, 3),
     }  # fmt: skip
     for name, tensor in face.tensors().items():
         if tuple(tensor.shape) != shapes[name]:

@@ -33,9 +33,11 @@ from mien.face.listing import (
     with_ending,
 )
 from mien.face.model import FaceModel, Landmarks
+from mien.plugins import named
 
 TENSORS = tuple(AXES)
 _BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
+_BUST = "anny-bust"  # the face model that has the same head, and its landmarks
 _NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
 _LANDMARK_SUFFIX = ".landmarks.json"
 _NO_TEETH = "-no-teeth"
@@ -70,6 +72,11 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
         model = source.bake()
         write_face_model(stem, model)
         return model
+
+
+def bake_bust() -> FaceModel:
+    """Build the bust on the head-only model of the cache."""
+    return named("mien.face.models.anny_bust:bake_anny_bust")(load_face_model_without_landmarks(_BASE))
 
 
 def coefficient_count(name: str) -> int | None:
@@ -164,6 +171,9 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """Return the landmark sets of a face model: those that ship with mien, or those placed when the user added it."""
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
+    if name == _BUST:
+        # The triangles of the head come first, and lie on the same vertices.
+        name, model = _BASE, replace(model, faces=model.faces[~model.region_mask("bust")])
     name = name if coefficient_count(name) is None else _BASE
     shipped = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
     file = shipped if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)

