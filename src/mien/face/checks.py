@@ -44,6 +44,8 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
         "joints": (b, len(model.free_joint_names), 3), "head_rotation": (b, 3), "head_translation": (b, 3),
         "vertex_offsets": (v, 3), "torso_rotation": (b, 3), "torso_translation": (b, 3),
     }  # fmt: skip
+    if (face.torso_rotation is None) != (face.torso_translation is None):
+        raise UserError(f"{where}: has a rotation or a translation of the torso without the other; {remedy}")
     for name, tensor in face.tensors().items():
         if tuple(tensor.shape) != shapes[name]:
             fault = f"{name} is {list(tensor.shape)}, but the face model {model.name!r} has {list(shapes[name])}"

@@ -43,8 +43,8 @@ class FaceModel:
     All lengths are in metres, in the head frame: +x to the subject's left, +y up, +z ahead, origin about between the
     ears. Joint 0 is `head`. It is at the origin, and its motion is the head pose itself (`FaceParams.T_world_head`).
     Other joints move relative to their parent. A joint's motion is either free (a row of `FaceParams.joints`), or
-    derived from the expression, or a share of the torso's. A derived joint (such as a jaw that follows `jawOpen`) turns by
-    `joint_rotation_basis` and shifts by `joint_translation_basis`, both linear in the expression.
+    derived from the expression, or a share of the torso's. A derived joint (such as a jaw that follows `jawOpen`)
+    turns by `joint_rotation_basis` and shifts by `joint_translation_basis`, both linear in the expression.
     """
 
     name: str

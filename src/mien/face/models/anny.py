@@ -161,14 +161,25 @@ def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndar
     people[:, parts["tongue"]] = tongue
 
 
-def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"], edges_below: int = 1) -> None:
     """Smooth the lower edge of the neck in place; the rings above follow like a membrane.
+
+    With three `edges_below`, these are those of a bust: the chest and the two arms.
 
     The change is linear, so identity stays linear.
     """
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
-    loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
+    border, height = edges[times == 1], people[..., 1].mean(0)
+    for _ in range(edges_below):
+        loop = _lowest_loop(border, height)
+        _smooth_edge(people, edges, loop)
+        border = border[~np.isin(border, loop).any(1)]
+
+
+def _smooth_edge(
+    people: Float[np.ndarray, "s v 3"], edges: Int[np.ndarray, "e 2"], loop: Int[np.ndarray, " n"]
+) -> None:
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
     move = np.linalg.matrix_power(step, _ANNY_COLLAR_STEPS) - np.eye(len(loop))
     ring = np.full(people.shape[1], _ANNY_COLLAR_RINGS + 1)

