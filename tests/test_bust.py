@@ -67,8 +67,9 @@ def test_the_mesh_is_closed_from_the_head_to_the_chest_and_faces_outwards(bust):
     below = bust.faces[mask].unique()
     points = bust.template[below]
     assert 0.36 < points[:, 0].max() - points[:, 0].min() < 0.56
-    assert -0.50 < points[:, 1].min() < -0.40
-    assert torch.cdist(bust.template * torch.tensor([-1.0, 1.0, 1.0]), bust.template).min(1).values.max() < 2e-5
+    assert -0.55 < points[:, 1].min() < -0.45
+    template = bust.template.double()
+    assert torch.cdist(template * torch.tensor([-1.0, 1.0, 1.0]), template).min(1).values.max() < 1e-5
     edges = torch.cat([bust.faces[:, [0, 1]], bust.faces[:, [1, 2]], bust.faces[:, [2, 0]]])
     unique, counts = edges.sort(1).values.unique(dim=0, return_counts=True)
     assert counts.max() == 2
@@ -91,7 +92,9 @@ def test_the_mesh_is_closed_from_the_head_to_the_chest_and_faces_outwards(bust):
 def test_the_torso_stands_still_while_the_head_moves_and_moves_with_it_by_default(bust):
     face = turned(bust)
     ours, theirs = of_bust(bust), in_head(bust)
-    assert set(bust.faces[bust.region_mask("bust")].unique().tolist()) <= set(ours.tolist())
+    below = bust.faces[bust.region_mask("bust")].unique()
+    assert torch.isin(below, ours).float().mean() > 0.9
+    assert bust.skinning_weights[below, bust.joint_names.index("torso")].min() > 0.5
     still = bust(still_torso(bust, face))
     torch.testing.assert_close(still[:, ours], still[:1, ours].expand(len(face), -1, -1), atol=2e-6, rtol=0)
     moving = bust(face)
@@ -107,13 +110,15 @@ def test_the_torso_stands_still_while_the_head_moves_and_moves_with_it_by_defaul
 
 
 def test_the_neck_between_them_neither_tears_nor_shrinks(bust):
-    face = still_torso(bust, turned(bust))
+    face = still_torso(bust, replace(turned(bust), head_translation=torch.zeros(1 + len(POSES), 3)))
     edges = torch.cat([bust.faces[:, [0, 1]], bust.faces[:, [1, 2]], bust.faces[:, [2, 0]]])
     bent = bust.skinning_weights[:, [0, bust.joint_names.index("torso")]].amax(1) < 1
     edges = edges[bent[edges].any(1)]
     lengths = torch.stack([(v[edges[:, 0]] - v[edges[:, 1]]).norm(dim=1) for v in bust(face)])
-    stretch = lengths[1:4] / lengths[0].clamp_min(1e-3)
-    assert stretch.max() < 2.2
+    # Nodding, turning and tilting by 20 degrees.
+    stretch = lengths[1:4] / lengths[0]
+    assert stretch.max() < 2.0
+    assert stretch.min() > 0.5
     # Twisted by 60 degrees, the middle of the neck keeps its girth: half of the turn is the neck joint's.
     twisted = bust.neutral(2)
     twisted.head_rotation[1, 1] = torch.pi / 3
@@ -171,8 +176,6 @@ def test_parameters_keep_the_torso_when_they_are_cut_and_joined(bust):
     assert turned(bust)[0].torso_rotation is None
     with pytest.raises(UserError, match="without the other"):
         check_face_params(bust, replace(face, torso_rotation=None), "FILE", "track again")
-    with pytest.raises(UserError, match="torso_rotation is"):
-        check_face_params(bust, replace(face, torso_rotation=torch.zeros(2, 3)), "FILE", "track again")
 
 
 def test_the_base_of_the_neck_is_where_it_is_without_a_bust(head_only, bust):

@@ -102,11 +102,14 @@ def coefficient_head(base: FaceModel, count: int) -> FaceModel:
 
 def without_teeth(model: FaceModel) -> FaceModel:
     """Return the face model without the triangles of teeth. Its vertices stay."""
-    kept = ~model.region_mask("teeth")
+    return replace(_without(model, "teeth"), name=f"{model.name}{_NO_TEETH}")
+
+
+def _without(model: FaceModel, region: str) -> FaceModel:
+    kept = ~model.region_mask(region)
     place = (torch.cumsum(kept.long(), 0) - 1).clamp_min(0)
     return replace(
         model,
-        name=f"{model.name}{_NO_TEETH}",
         faces=model.faces[kept],
         uv_faces=model.uv_faces[kept],
         face_regions=model.face_regions[kept],
@@ -173,7 +176,7 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
     if name == _BUST:
         # The triangles of the head come first, and lie on the same vertices.
-        name, model = _BASE, replace(model, faces=model.faces[~model.region_mask("bust")])
+        name, model = _BASE, _without(model, "bust")
     name = name if coefficient_count(name) is None else _BASE
     shipped = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
     file = shipped if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)

@@ -36,12 +36,15 @@ from mien.machine.progress import progress_bar
 from mien.rotation import matrix_from_axis_angle
 
 BUILD = 12  # number of identity directions of the build
-_NECK_PLANES = (0.655, 0.585)
+_NECK_PLANES = (0.655, 0.578)
 """Values of y + 0.5 z, in metres of the base mesh, between which the torso's share of the motion rises from 0 to 1. The
 upper one is that of the head-only model; the lower one is where the neck meets the shoulders. Set by eye."""
-_HANGING = (39.0, 5.0)
+_NECK_RAMP = 0.25
+"""Share of this way over which the rise begins, and ends. Between them it is even, so that no ring of the neck stretches
+most."""
+_HANGING = (37.0, 4.0)
 """Mean and spread of the angle in degrees by which the source's arms, which stand off, are lowered. A hanging arm is
-some 5 degrees off the vertical."""
+some 6 degrees off the vertical."""
 _FLEXED = (4.0, 8.0)  # the same of the angle by which upper arms point ahead
 _SHRUGGED = (0.0, 4.0)  # the same of the angle by which the collar bones are raised
 _ONE_SIDED = 0.3  # difference between the two sides, as a share of these spreads
@@ -155,7 +158,9 @@ def torso_share(base: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
     """The torso's share of each vertex' motion: 0 on the head, 1 on the bust, rising smoothly down the neck."""
     top, bottom = _NECK_PLANES
     t = np.clip((top - base[:, 1] - 0.5 * base[:, 2]) / (top - bottom), 0, 1)
-    return t * t * (3 - 2 * t)
+    ramp = 0.5 / (_NECK_RAMP * (1 - _NECK_RAMP))
+    rising, even, ending = ramp * t**2, (t - 0.5 * _NECK_RAMP) / (1 - _NECK_RAMP), 1 - ramp * (1 - t) ** 2
+    return np.where(t < _NECK_RAMP, rising, np.where(t > 1 - _NECK_RAMP, ending, even))
 
 
 def _identity(

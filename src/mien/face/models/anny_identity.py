@@ -15,7 +15,7 @@ ANNY_COMPONENTS = 80  # number of identity directions that are kept
 _ANNY_LOCAL_SPREAD = 0.17
 """Standard deviation of a local control, which ranges over -1..1. Measured: 0.35 has twice the variance of real people,
 and 0.17 matches published head measurements (log)."""
-_ANNY_BUILD_SPREAD = 0.25  # the same of the controls of chest, shoulders and upper arms
+_ANNY_BUILD_SPREAD = 0.25  # the same of the controls of neck, chest, shoulders and upper arms
 _ANNY_ASYMMETRY = 0.25  # difference between the two sides of a sided control, as a fraction of its standard deviation
 
 QUANTUM = 1e-6

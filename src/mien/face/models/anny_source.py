@@ -124,13 +124,14 @@ def head_controls(data: Path) -> list[Control]:
 
 
 def build_controls(data: Path) -> list[Control]:
-    """Return the local shape controls of chest, shoulders and upper arms, in alphabetical order.
+    """Return the local shape controls of neck, chest, shoulders and upper arms, in alphabetical order.
 
-    Those of the forearms are left out, and the shift of the torso to one side, which no body has.
+    Those of the forearms and of the chin are left out, and shifts to one side, which no body has.
     """
-    found = _controls_in(data, ("torso", "arms"))
-    kept = [one for one in found if "lowerarm" not in one.name and "trans-in-out" not in one.name]
-    return sorted(kept, key=lambda one: (one.name, one.side))
+    left_out = ("lowerarm", "trans-in-out", "neck-double")
+    found = _controls_in(data, ("neck", "torso", "arms"))
+    kept = [control for control in found if not any(part in control.name for part in left_out)]
+    return sorted(kept, key=lambda control: (control.name, control.side))
 
 
 def joint_cubes(data: Path) -> dict[str, Int[np.ndarray, " n"]]:
