@@ -176,11 +176,14 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
     if name == _BUST:
         # The triangles of the head come first, and lie on the same vertices.
-        name, model = _BASE, _without(model, "bust")
+        return {**read_landmarks(_BASE, _without(model, "bust")), **_read_landmark_file(_shipped(name), name, model)}
     name = name if coefficient_count(name) is None else _BASE
-    shipped = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
-    file = shipped if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)
+    file = _shipped(name) if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)
     return _read_landmark_file(file, name, model) if file.is_file() else {}
+
+
+def _shipped(name: str) -> Path:
+    return Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
 
 
 def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, Landmarks]:

@@ -130,6 +130,15 @@ class FaceModel:
         """`torso_shares` as numbers, so that no step waits for a GPU; 0 without a torso."""
         return (0.0,) * len(self.joint_names) if self.torso_shares is None else tuple(self.torso_shares.tolist())
 
+    @cached_property
+    def build_directions(self) -> slice:
+        """Which identity directions move no part of the head: the last ones of a model with a torso, else none."""
+        count = len(self.identity_basis)
+        if self.torso_shares is None:
+            return slice(count, count)
+        moves_head = self.identity_basis[:, self.skinning_weights[:, 0] == 1].flatten(1).any(1)
+        return slice(int(moves_head.nonzero().max()) + 1, count)
+
     def neutral(self, timesteps: int = 1) -> FaceParams:
         """Return parameters of the mean person at rest at the world's origin."""
         like = self.template

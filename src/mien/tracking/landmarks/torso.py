@@ -1,0 +1,122 @@
+"""Fit a torso to the shoulders that MediaPipe's pose network finds: one rigid pose a frame, and one build a person.
+
+Two points do not tell a rigid pose, so the rest comes from the body: the torso hangs on a head whose pose is known,
+moves smoothly in the room, and has the shoulders of a person with this head.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mien.camera import Camera
+from mien.face.model import FaceModel
+from mien.face.params import FaceParams
+from mien.face.torso import resting_torso, torso_motion, torso_origin
+from mien.rotation import matrix_from_axis_angle
+
+SHOULDERS = (11, 12)
+"""Points of the pose network: the left and the right shoulder of the person."""
+_ITERATIONS = 300
+
+
+@dataclass(frozen=True)
+class TorsoPriors:
+    """Standard deviations of what is known before a picture is seen. Set by what bodies do, not tuned."""
+
+    pixels: float = 0.02
+    """Of a shoulder's place in the picture, in shoulder widths."""
+    depth: float = 0.25
+    """Of the difference in depth of both shoulders, as the network guesses it, in shoulder widths."""
+    shift: float = 0.015
+    """Of the torso's shift against the head, in metres: a neck is neither longer nor shorter than itself."""
+    turn: float = 0.5
+    """Of its turn against the head, about each axis, in radians."""
+    acceleration: float = 1.0
+    """In metres per second squared."""
+    angular_acceleration: float = 3.0
+    """In radians per second squared."""
+    response: float = 0.03
+    """Of the distance between the network's shoulder and the model's, the same in all frames, in metres."""
+
+
+def fit_torso(
+    model: FaceModel,
+    face: FaceParams,
+    camera: Camera,
+    points: Float[Tensor, "b 33 4"],
+    timestamps: Float[Tensor, " b"],
+    priors: TorsoPriors = TorsoPriors(),
+) -> FaceParams:
+    """Return the same faces with a torso and a build that fit the points (x, y, z in pixels, visibility).
+
+    z is the depth against the hips, as large as x is, and points away from the camera. Frames without points have NaN.
+    The build is what the identity has beyond the directions of the head; these stay as they are.
+    """
+    like = torch.zeros((), dtype=torch.float64)
+    model, face, camera = model.to(like), face.to(like), camera.to(like)
+    seen, times = points[:, SHOULDERS].to(like), timestamps.to(like)
+    start = resting_torso(model, face)
+    assert start.torso_rotation is not None
+    assert start.torso_translation is not None
+    turn = 0.3 * start.torso_rotation
+    build = model.build_directions
+    unknown = [turn, start.torso_translation.clone(), face.identity[build].clone(), torch.zeros(3).to(like)]
+    for tensor in unknown:
+        tensor.requires_grad_()
+    optimizer = torch.optim.LBFGS(unknown, max_iter=_ITERATIONS, history_size=30, line_search_fn="strong_wolfe")
+    cost = _cost_of(model, face, camera, (seen, times), priors)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        value = cost(*unknown)
+        value.backward()
+        return value
+
+    optimizer.step(closure)  # pyright: ignore[reportArgumentType]
+    turn, place, own, _ = (tensor.detach() for tensor in unknown)
+    return _with(face, build, turn, place, own).to(torch.zeros(()))
+
+
+def _with(face: FaceParams, build: slice, turn: Tensor, place: Tensor, own: Tensor) -> FaceParams:
+    identity = torch.cat([face.identity[: build.start], own])
+    return replace(face, identity=identity).with_torso(turn, place)
+
+
+def _cost_of(
+    model: FaceModel, face: FaceParams, camera: Camera, given: tuple[Tensor, Tensor], priors: TorsoPriors
+) -> Callable[..., Tensor]:
+    """Return the sum of squares of a turn, a place, a build and a response in terms of the priors."""
+    seen, times = given
+    visible = seen[..., 3].clamp(0, 1).nan_to_num(0.0)
+    there, depth = seen[..., :2].nan_to_num(0.0), seen[..., 2].nan_to_num(0.0)
+    width = (there[:, 0] - there[:, 1]).norm(dim=1)[visible.amin(1) > 0.5].median()
+    steps = 0.5 * (times[2:] - times[:-2])
+    mirror = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]).to(times)
+    shoulders = model.landmarks["shoulders"]
+
+    def cost(turn: Tensor, place: Tensor, own: Tensor, response: Tensor) -> Tensor:
+        current = _with(face, model.build_directions, turn, place, own)
+        pairs = shoulders.positions(model.rest_vertices(current), model.faces).reshape(2, 2, 3).mean(1)
+        local = pairs - torso_origin(model, current) + mirror * response
+        world = local @ matrix_from_axis_angle(turn).mT + place[:, None]
+        pixels, z = camera.project(world)
+        off = (pixels - there) / (priors.pixels * width)
+        # Cauchy: a shoulder that is far off is a wrong one.
+        total = (visible * torch.log1p((off * off).sum(-1))).sum()
+        scale = camera.K[0, 0] / z.mean(1)
+        total = (
+            total
+            + (visible.amin(1) * ((z[:, 0] - z[:, 1]) * scale - depth[:, 0] + depth[:, 1]).square()).sum()
+            / (priors.depth * width).square()
+        )
+        motion = torso_motion(model, current)
+        total = total + (motion.shift / priors.shift).square().sum() + (motion.rotation / priors.turn).square().sum()
+        for path, sigma in ((place, priors.acceleration), (turn, priors.angular_acceleration)):
+            bend = (path[2:] - 2 * path[1:-1] + path[:-2]) / steps[:, None] ** 2
+            total = total + (bend / sigma).square().sum()
+        return total + own.square().sum() + (response / priors.response).square().sum()
+
+    return cost
