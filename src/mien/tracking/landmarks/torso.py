@@ -28,12 +28,12 @@ class TorsoPriors:
 
     pixels: float = 0.02
     """Of a shoulder's place in the picture, in shoulder widths."""
-    depth: float = 0.25
-    """Of the difference in depth of both shoulders, as the network guesses it, in shoulder widths."""
     shift: float = 0.015
     """Of the torso's shift against the head, in metres: a neck is neither longer nor shorter than itself."""
     turn: float = 0.5
     """Of its turn against the head, about each axis, in radians."""
+    still: float = 0.1
+    """Of its turn in the room against the mean of the head's, in radians."""
     acceleration: float = 1.0
     """In metres per second squared."""
     angular_acceleration: float = 3.0
@@ -50,10 +50,10 @@ def fit_torso(
     timestamps: Float[Tensor, " b"],
     priors: TorsoPriors = TorsoPriors(),
 ) -> FaceParams:
-    """Return the same faces with a torso and a build that fit the points (x, y, z in pixels, visibility).
+    """Return the same faces with a torso and a build that fit the points (x and y in pixels, z, visibility).
 
-    z is the depth against the hips, as large as x is, and points away from the camera. Frames without points have NaN.
-    The build is what the identity has beyond the directions of the head; these stay as they are.
+    Frames without points have NaN. z is not used: the network guesses turns of 40 degrees that are not there. The build
+    is what the identity has beyond the directions of the head, which stay as they are.
     """
     like = torch.zeros((), dtype=torch.float64)
     model, face, camera = model.to(like), face.to(like), camera.to(like)
@@ -91,29 +91,33 @@ def _cost_of(
     """Return the sum of squares of a turn, a place, a build and a response in terms of the priors."""
     seen, times = given
     visible = seen[..., 3].clamp(0, 1).nan_to_num(0.0)
-    there, depth = seen[..., :2].nan_to_num(0.0), seen[..., 2].nan_to_num(0.0)
+    there = seen[..., :2].nan_to_num(0.0)
     width = (there[:, 0] - there[:, 1]).norm(dim=1)[visible.amin(1) > 0.5].median()
     steps = 0.5 * (times[2:] - times[:-2])
     mirror = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]).to(times)
-    shoulders = model.landmarks["shoulders"]
+    shoulders, build = model.landmarks["shoulders"], model.build_directions
+    origin = torso_origin(model, face)  # No build moves it.
+    middle = face.head_rotation.mean(0)
+
+    def pairs_of(vertices: Tensor) -> Tensor:
+        """Return the shoulders, each the mean of two points."""
+        found = shoulders.positions(vertices, model.faces)
+        return found.reshape(*found.shape[:-2], 2, 2, 3).mean(-2)
+
+    known = face.identity.clone()
+    known[build] = 0
+    rest = pairs_of(model.rest_vertices(replace(face, identity=known)))
+    directions = pairs_of(model.identity_basis[build])
 
     def cost(turn: Tensor, place: Tensor, own: Tensor, response: Tensor) -> Tensor:
-        current = _with(face, model.build_directions, turn, place, own)
-        pairs = shoulders.positions(model.rest_vertices(current), model.faces).reshape(2, 2, 3).mean(1)
-        local = pairs - torso_origin(model, current) + mirror * response
+        local = rest + torch.einsum("i,ikc->kc", own, directions) - origin + mirror * response
         world = local @ matrix_from_axis_angle(turn).mT + place[:, None]
-        pixels, z = camera.project(world)
-        off = (pixels - there) / (priors.pixels * width)
+        off = (camera.project(world)[0] - there) / (priors.pixels * width)
         # Cauchy: a shoulder that is far off is a wrong one.
         total = (visible * torch.log1p((off * off).sum(-1))).sum()
-        scale = camera.K[0, 0] / z.mean(1)
-        total = (
-            total
-            + (visible.amin(1) * ((z[:, 0] - z[:, 1]) * scale - depth[:, 0] + depth[:, 1]).square()).sum()
-            / (priors.depth * width).square()
-        )
-        motion = torso_motion(model, current)
+        motion = torso_motion(model, face.with_torso(turn, place))
         total = total + (motion.shift / priors.shift).square().sum() + (motion.rotation / priors.turn).square().sum()
+        total = total + ((turn - middle) / priors.still).square().sum()
         for path, sigma in ((place, priors.acceleration), (turn, priors.angular_acceleration)):
             bend = (path[2:] - 2 * path[1:-1] + path[:-2]) / steps[:, None] ** 2
             total = total + (bend / sigma).square().sum()
