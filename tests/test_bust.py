@@ -6,16 +6,22 @@ import pytest
 import torch
 from torch import Tensor
 
+from known import known
+from mien.camera import Camera
 from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.checks import check_face_params
 from mien.face.params import concatenate
 from mien.face.torso import plain_face, plain_model, resting_torso, still_torso, torso_motion, torso_of_neck
 from mien.rotation import matrix_from_axis_angle
+from mien.tracking.landmarks.torso import SHOULDERS, fit_torso
 from mien.tracking.neck_line import bottom_vertices
 
 head_only = pytest.fixture(scope="module")(lambda: load_face_model("anny"))
 bust = pytest.fixture(scope="module")(lambda: load_face_model("anny-bust"))
+CAMERA = Camera(
+    torch.tensor([[700.0, 0, 256], [0, 700, 256], [0, 0, 1]]), torch.diag(torch.tensor([1.0, -1, -1, 1])), 512, 512
+)
 POSES = torch.tensor([[0.0, 0.35, 0.0], [0.35, 0.0, 0.0], [0.0, 0.0, -0.35], [0.3, -0.9, 0.2]])
 
 
@@ -180,3 +186,27 @@ def test_parameters_keep_the_torso_when_they_are_cut_and_joined(bust):
 
 def test_the_base_of_the_neck_is_where_it_is_without_a_bust(head_only, bust):
     assert torch.equal(bottom_vertices(bust), bottom_vertices(head_only))
+
+
+def test_a_torso_is_found_by_its_shoulders_without_those_that_are_wrong(bust):
+    times = torch.arange(24) / 12
+    face = bust.neutral(len(times))
+    face.head_translation[:, 2] = -0.8
+    face.head_rotation[:, 1] = 0.4 * torch.sin(2 * times)
+    face.identity[bust.build_directions.start + 2] = 1.0
+    place = known(still_torso(bust, face).torso_translation) + 0.01 * torch.sin(times)[:, None]
+    turn = torch.stack([0 * times, 0.1 * torch.sin(times), 0.1 * torch.cos(times)], dim=1)
+    truth = face.with_torso(turn, place)
+    shoulders = bust.landmark_positions(bust(truth), "shoulders").reshape(len(times), 2, 2, 3).mean(2)
+    points = torch.full((len(times), 33, 4), torch.nan)
+    points[:, SHOULDERS] = torch.cat([CAMERA.project(shoulders)[0], torch.ones(len(times), 2, 2)], dim=2)
+    points[5] = torch.nan
+    points[9, SHOULDERS[0], :2] += 80.0
+    found = fit_torso(bust, replace(face, identity=torch.zeros_like(face.identity)), CAMERA, points, times)
+    width = (shoulders[0, 0] - shoulders[0, 1]).norm()
+    assert (known(found.torso_translation) - place).norm(dim=1).max() < 0.04 * width
+    off = torch.rad2deg(known(found.torso_rotation) - turn)
+    assert off[:, 2].abs().max() < 2.0, "shoulders show a roll"
+    assert off.norm(dim=1).median() < 6.0
+    assert not found.identity[: bust.build_directions.start].any()
+    assert found.identity[bust.build_directions].norm() > 0.1
