@@ -33,7 +33,9 @@ class TorsoPriors:
     turn: float = 0.5
     """Of its turn against the head, about each axis, in radians."""
     still: float = 0.1
-    """Of its turn in the room against the mean of the head's, in radians."""
+    """Of its turn in the room against the pose that it has most, in radians."""
+    facing: float = 0.15
+    """Of that pose against the mean of the head's, in radians."""
     acceleration: float = 1.0
     """In metres per second squared."""
     angular_acceleration: float = 3.0
@@ -61,23 +63,31 @@ def fit_torso(
     start = resting_torso(model, face)
     assert start.torso_rotation is not None
     assert start.torso_translation is not None
-    turn = 0.3 * start.torso_rotation
-    build = model.build_directions
-    unknown = [turn, start.torso_translation.clone(), face.identity[build].clone(), torch.zeros(3).to(like)]
-    for tensor in unknown:
-        tensor.requires_grad_()
+    # Every unknown counts in its prior's unit, so that the descent sees a round valley.
+    starts = (
+        0.3 * start.torso_rotation,
+        start.torso_translation,
+        face.identity[model.build_directions],
+        like.new_zeros(3),
+        face.head_rotation.mean(0),
+    )
+    scales = priors.still, priors.shift, 1.0, priors.response, priors.facing
+    unknown = [torch.zeros_like(value).requires_grad_() for value in starts]
     optimizer = torch.optim.LBFGS(unknown, max_iter=_ITERATIONS, history_size=30, line_search_fn="strong_wolfe")
     cost = _cost_of(model, face, camera, (seen, times), priors)
 
+    def values() -> list[Tensor]:
+        return [value + scale * step for value, scale, step in zip(starts, scales, unknown, strict=True)]
+
     def closure() -> Tensor:
         optimizer.zero_grad()
-        value = cost(*unknown)
+        value = cost(*values())
         value.backward()
         return value
 
     optimizer.step(closure)  # pyright: ignore[reportArgumentType]
-    turn, place, own, _ = (tensor.detach() for tensor in unknown)
-    return _with(face, build, turn, place, own).to(torch.zeros(()))
+    turn, place, own, *_ = (value.detach() for value in values())
+    return _with(face, model.build_directions, turn, place, own).to(torch.zeros(()))
 
 
 def _with(face: FaceParams, build: slice, turn: Tensor, place: Tensor, own: Tensor) -> FaceParams:
@@ -88,7 +98,7 @@ def _with(face: FaceParams, build: slice, turn: Tensor, place: Tensor, own: Tens
 def _cost_of(
     model: FaceModel, face: FaceParams, camera: Camera, given: tuple[Tensor, Tensor], priors: TorsoPriors
 ) -> Callable[..., Tensor]:
-    """Return the sum of squares of a turn, a place, a build and a response in terms of the priors."""
+    """Return the sum of squares of a turn, a place, a build, a response and a mean turn in terms of the priors."""
     seen, times = given
     visible = seen[..., 3].clamp(0, 1).nan_to_num(0.0)
     there = seen[..., :2].nan_to_num(0.0)
@@ -97,7 +107,7 @@ def _cost_of(
     mirror = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]).to(times)
     shoulders, build = model.landmarks["shoulders"], model.build_directions
     origin = torso_origin(model, face)  # No build moves it.
-    middle = face.head_rotation.mean(0)
+    ahead = face.head_rotation.mean(0)
 
     def pairs_of(vertices: Tensor) -> Tensor:
         """Return the shoulders, each the mean of two points."""
@@ -109,7 +119,7 @@ def _cost_of(
     rest = pairs_of(model.rest_vertices(replace(face, identity=known)))
     directions = pairs_of(model.identity_basis[build])
 
-    def cost(turn: Tensor, place: Tensor, own: Tensor, response: Tensor) -> Tensor:
+    def cost(turn: Tensor, place: Tensor, own: Tensor, response: Tensor, most: Tensor) -> Tensor:
         local = rest + torch.einsum("i,ikc->kc", own, directions) - origin + mirror * response
         world = local @ matrix_from_axis_angle(turn).mT + place[:, None]
         off = (camera.project(world)[0] - there) / (priors.pixels * width)
@@ -117,7 +127,7 @@ def _cost_of(
         total = (visible * torch.log1p((off * off).sum(-1))).sum()
         motion = torso_motion(model, face.with_torso(turn, place))
         total = total + (motion.shift / priors.shift).square().sum() + (motion.rotation / priors.turn).square().sum()
-        total = total + ((turn - middle) / priors.still).square().sum()
+        total = total + ((turn - most) / priors.still).square().sum() + ((most - ahead) / priors.facing).square().sum()
         for path, sigma in ((place, priors.acceleration), (turn, priors.angular_acceleration)):
             bend = (path[2:] - 2 * path[1:-1] + path[:-2]) / steps[:, None] ** 2
             total = total + (bend / sigma).square().sum()
