@@ -1,4 +1,4 @@
-# make setup | web-packages | chromium | web | demo | test | test-long | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
+# make setup | web-packages | chromium | web | demo | studio | test | test-long | test-312 | test-exact | sanitize | fuzz | kills | mutate | lint | docs | release | elsewhere | bench | gpu. The environment is VENV; everything else is in pyproject.toml.
 # The first Python that runs: what lies on the PATH may be a stand-in of pyenv that leads nowhere.
 PYTHON ?= $(shell for python in python3.11 python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
 PYTHON312 ?= $(shell for python in python3.12 $(HOME)/.pyenv/versions/3.12*/bin/python3.12; do $$python -c "" 2>/dev/null && break; done; echo $$python)
@@ -11,7 +11,7 @@ UV := uv==0.13.8
 GSPLAT := gsplat==1.5.3
 ZIGLANG := ziglang==0.17.1
 
-.PHONY: setup landmarker web-packages chromium web build demo test test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
+.PHONY: setup landmarker web-packages chromium web build demo studio test test-long test-312 test-312-part test-exact sanitize fuzz fuzz-native fuzz-datasets kills mutate lint format docs release elsewhere bench gpu batch-engines test-engines lock clean
 setup: $(VENV)/.built landmarker
 
 $(VENV)/.packages: requirements/lock.txt requirements/uv.txt
@@ -70,6 +70,9 @@ web: web/node_modules/.installed
 
 demo: setup
 	$(BIN)/mien demo --out out/demo
+
+studio: setup
+	$(BIN)/mien studio out/people
 
 # Everything that a change can break: one process a core, each with one thread (tests/conftest.py says how many).
 test: setup web-packages chromium
@@ -148,8 +151,8 @@ mutate: setup web-packages
 
 # pyright's wrapper asks the package index for a newer version unless it is told not to.
 lint: setup
-	$(BIN)/ruff check src tests examples benchmarks release docs/site docs/pictures
-	$(BIN)/ruff format --check src tests examples benchmarks release docs/site docs/pictures
+	$(BIN)/ruff check src tests examples benchmarks release docs/site docs/pictures web/conformance
+	$(BIN)/ruff format --check src tests examples benchmarks release docs/site docs/pictures web/conformance
 	$(BIN)/clang-format --dry-run --Werror $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 	$(BIN)/python tests/sizes.py
 	$(BIN)/python tests/rooms.py mien
@@ -159,8 +162,8 @@ lint: setup
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
 
 format: setup
-	$(BIN)/ruff check --fix src tests examples benchmarks release docs/site docs/pictures
-	$(BIN)/ruff format src tests examples benchmarks release docs/site docs/pictures
+	$(BIN)/ruff check --fix src tests examples benchmarks release docs/site docs/pictures web/conformance
+	$(BIN)/ruff format src tests examples benchmarks release docs/site docs/pictures web/conformance
 	$(BIN)/clang-format -i $(wildcard native/*.cpp native/*.h native/*/*.cpp native/*/*.h)
 
 # The site of the documentation, with the reference of the public API: build/docs/index.html. A broken link is an error.
@@ -200,14 +203,12 @@ elsewhere: setup
 bench: setup
 	$(BIN)/mien bench render
 
-# On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked
-# gpu, then the figures for docs/results.md, into out/gpu.
+# On a machine with an NVIDIA GPU and the CUDA toolkit (gsplat compiles its kernels at first use): the tests marked gpu, a step
+# of each method and `mien create` on a clip (VIDEO=FILE, or a synthetic head), in eight minutes. It prints a table.
+VIDEO ?=
 gpu: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --require-hashes --no-deps -r requirements/gsplat.txt
-	$(BIN)/pytest -m gpu
-	mkdir -p out/gpu
-	$(BIN)/mien bench render --device cuda --json > out/gpu/render.json
-	$(BIN)/mien bench train-step --device cuda --json > out/gpu/train_step.json
+	$(BIN)/python benchmarks/device.py --out out/gpu $(VIDEO:%=--video %)
 
 clean:
 	rm -rf build dist out .venv .venv312

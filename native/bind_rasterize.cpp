@@ -192,6 +192,8 @@ void bind_rasterize(nb::module_& module) {
       "Without `differentiable`, there can be no backward pass.");
   module.def("rasterize_views_backward", &backward, "views"_a, "Fills the gradients of each view.");
   module.def("thread_count", &mien::thread_count, "The number of threads that native operations use.");
+  module.def("keep_loops_serial", &mien::keep_loops_serial, "serial"_a,
+             "Makes all loops of the calling thread serial, or not: for threads that share the cores between them.");
   module.def("set_thread_count", &mien::set_thread_count, "count"_a, nb::call_guard<nb::gil_scoped_release>(),
              "Sets the number of threads; 0 is the default.");
   module.def("rasterize_isa", &mien::rasterize_isa, "The instruction set of the rasterizer's kernels.");

@@ -30,9 +30,9 @@ struct Corrections {
   float step_size, second_unbiased;
 };
 
-// Adam's corrections of its running means at the next step, which is counted.
-Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate) {
-  const double count = *steps.data() += 1;
+// Adam's corrections of its running means at the next step, which is counted and averages `frames`.
+Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate, int frames = 1) {
+  const double count = frames * static_cast<double>(*steps.data() += 1);
   return {static_cast<float>(rate / (1 - std::pow(kBeta1, count))),
           static_cast<float>(1 / std::sqrt(1 - std::pow(kBeta2, count)))};
 }
@@ -40,22 +40,26 @@ Corrections next_corrections(const Array<float, nb::shape<>>& steps, double rate
 // One tensor's arrays, which stay alive while this does.
 struct AdamArrays {
   static constexpr char kName[] = "AdamTask";
-  static constexpr const char* kFields[] = {"values", "gradient", "first", "second", "steps", "rate"};
+  static constexpr const char* kFields[] = {"values", "gradient", "first", "second", "steps", "rate", "frames"};
   Array<float> values;
   Array<const float> gradient;
   Array<float> first, second;
   Array<float, nb::shape<>> steps;
   double rate = 0;
+  int frames = 1;
 
   explicit AdamArrays(const Group<AdamArrays>& group) {
-    group.read(values, gradient, first, second, steps, rate);
+    group.read(values, gradient, first, second, steps, rate, frames);
     require(same_shape(gradient, values) && same_shape(first, values) && same_shape(second, values),
             "gradient and moments must have the shape of the values");
+    require(frames > 0, "a step must average at least one frame");
   }
   mien::AdamTask step() const {
-    const Corrections found = next_corrections(steps, rate);
-    return {values.data(),   gradient.data(),      first.data(), second.data(), static_cast<int64_t>(values.size()),
-            found.step_size, found.second_unbiased};
+    const Corrections found = next_corrections(steps, rate, frames);
+    const mien::AdamDecays decays{static_cast<float>(std::pow(kBeta1, frames)),
+                                  static_cast<float>(std::pow(kBeta2, frames))};
+    return {values.data(),   gradient.data(),       first.data(), second.data(), static_cast<int64_t>(values.size()),
+            found.step_size, found.second_unbiased, decays};
   }
 };
 
@@ -79,6 +83,19 @@ void adam_update(const std::vector<Group<AdamArrays>>& groups) {
   for (const AdamArrays& own : arrays) tasks.push_back(own.step());
   const nb::gil_scoped_release release;
   mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
+}
+
+void add_arrays(const std::vector<Array<const float>>& first, const std::vector<Array<const float>>& second,
+                const std::vector<Array<float>>& sums) {
+  require(second.size() == first.size() && sums.size() == first.size(), "there must be as many arrays of each kind");
+  std::vector<mien::SumTask> tasks;
+  tasks.reserve(sums.size());
+  for (size_t i = 0; i < sums.size(); ++i) {
+    require(same_shape(first[i], sums[i]) && same_shape(second[i], sums[i]), "arrays must have the shape of their sum");
+    tasks.push_back({first[i].data(), second[i].data(), sums[i].data(), static_cast<int64_t>(sums[i].size())});
+  }
+  const nb::gil_scoped_release release;
+  mien::add_arrays(tasks.data(), static_cast<int>(tasks.size()));
 }
 
 void triangle_penalties(const std::array<float, 2>& thresholds, const std::array<float, 2>& weights, const Rows3& means,
@@ -180,6 +197,7 @@ void bind_training(nb::module_& module) {
              "Makes one step of Adam with values [n, k, f], whose gradient is a sum of outer products.");
   module.def("adam_update", &adam_update, "tasks"_a,
              "Makes one step of Adam with every tensor. The number of steps grows by one.");
+  module.def("add_arrays", &add_arrays, "first"_a, "second"_a, "sums"_a, "Fills the sums of two arrays each.");
   module.def("triangle_penalties", &triangle_penalties, "thresholds"_a, "weights"_a, "means"_a, "log_scales"_a,
              "radii"_a, "grad_means"_a, "grad_log_scales"_a, "position"_a, "scale"_a,
              "Fills the position and the scale penalty, and their gradients.");

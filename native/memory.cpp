@@ -2,6 +2,9 @@
 
 #include <deque>
 #include <mutex>
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
 
 namespace mien {
 namespace {
@@ -58,6 +61,17 @@ void give_memory(void* memory, size_t bytes) noexcept {
     kept.bytes -= kept.blocks.front().bytes;
     kept.blocks.pop_front();
   }
+}
+
+void release_memory() noexcept {
+  Spare& kept = spare();
+  const std::lock_guard<std::mutex> lock(kept.mutex);
+  for (const Block& block : kept.blocks) free_aligned(block.memory);
+  kept.blocks.clear();
+  kept.bytes = 0;
+#ifdef __GLIBC__
+  malloc_trim(0);
+#endif
 }
 
 }  // namespace mien

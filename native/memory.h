@@ -17,6 +17,8 @@ inline void free_aligned(void* memory) noexcept { ::operator delete(memory, std:
 void* take_memory(size_t bytes);
 // Keeps memory for the next `take_memory` of the same size, or frees it. `bytes` is the number it was taken with.
 void give_memory(void* memory, size_t bytes) noexcept;
+// Frees what is kept, and gives what the allocator holds free back to the system.
+void release_memory() noexcept;
 
 // Memory for `count` values that goes back at the end of its life. Throws std::bad_alloc.
 template <typename T>

@@ -256,4 +256,6 @@ void detail::run_loop(int64_t count, LoopBody body, void* context) {
   pool().run(count, body, context);
 }
 
+void keep_loops_serial(bool serial) { t_in_loop = serial; }
+
 }  // namespace mien

@@ -14,6 +14,9 @@ int thread_count();
 // Waits for a loop that is running, so it must not be called from within one.
 void set_thread_count(int count);
 
+// Makes all loops of the calling thread serial, or not. For threads that share the cores between them.
+void keep_loops_serial(bool serial);
+
 namespace detail {
 using LoopBody = void (*)(void* context, int64_t index);
 void run_loop(int64_t count, LoopBody body, void* context);

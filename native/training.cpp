@@ -41,9 +41,9 @@ PixelBox box_of_rows(const float* values, int width, int top, int bottom) {
   return {left, top, right, bottom};
 }
 
-}  // namespace
-
-void adam_update(const AdamTask* tasks, int count) {
+// Calls work(task, first, last) for pieces of the elements of all tasks, on all threads.
+template <typename Task, typename Work>
+void in_pieces(const Task* tasks, int count, const Work& work) {
   thread_local std::vector<Piece> pieces;
   pieces.clear();
   for (int task = 0; task < count; ++task) {
@@ -51,10 +51,22 @@ void adam_update(const AdamTask* tasks, int count) {
       pieces.push_back({task, first, std::min(first + kElements, tasks[task].count)});
     }
   }
-  const TrainingKernels& kernels = training_kernels();
   const Piece* all = pieces.data();
   parallel_for(static_cast<int64_t>(pieces.size()),
-               [&](int64_t index) { kernels.adam(tasks[all[index].task], all[index].first, all[index].last); });
+               [&](int64_t index) { work(tasks[all[index].task], all[index].first, all[index].last); });
+}
+
+}  // namespace
+
+void adam_update(const AdamTask* tasks, int count) {
+  const TrainingKernels& kernels = training_kernels();
+  in_pieces(tasks, count, [&](const AdamTask& task, int64_t first, int64_t last) { kernels.adam(task, first, last); });
+}
+
+void add_arrays(const SumTask* tasks, int count) {
+  in_pieces(tasks, count, [](const SumTask& task, int64_t first, int64_t last) {
+    for (int64_t i = first; i < last; ++i) task.sum[i] = task.first[i] + task.second[i];
+  });
 }
 
 void factored_adam_update(const FactoredAdamTask& task) {

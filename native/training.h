@@ -8,6 +8,11 @@
 
 namespace mien {
 
+// Decays of Adam's running means per update.
+struct AdamDecays {
+  float first = 0.9f, second = 0.999f;
+};
+
 // One tensor's update by Adam (Kingma and Ba 2015).
 struct AdamTask {
   float* values;
@@ -17,10 +22,19 @@ struct AdamTask {
   int64_t count;
   float step_size;        // rate / (1 - beta1^t)
   float second_unbiased;  // 1 / sqrt(1 - beta2^t)
+  AdamDecays decays;
 };
-constexpr float kAdamBeta1 = 0.9f, kAdamBeta2 = 0.999f, kAdamEpsilon = 1e-15f;
+constexpr float kAdamEpsilon = 1e-15f;
 
 void adam_update(const AdamTask* tasks, int count);
+
+// The sums of two arrays each, in an array of their own.
+struct SumTask {
+  const float *first, *second;
+  float* sum;
+  int64_t count;
+};
+void add_arrays(const SumTask* tasks, int count);
 
 // The same for values [n, k, f] whose gradient is a sum of outer products, so that it is never made. With one product,
 // bits are those of `adam_update` with that gradient, but for numbers below 1.2e-38, which become 0.

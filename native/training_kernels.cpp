@@ -23,11 +23,11 @@ MIEN_INLINE void store_some(float* to, int64_t valid, F value) {
 
 // One vector of a tensor at place i, whose gradient is g.
 template <class Task>
-MIEN_INLINE void adam_vector(const Task& task, int64_t i, int64_t valid, F g) {
-  const F beta1 = set1(kAdamBeta1), beta2 = set1(kAdamBeta2);
+MIEN_INLINE void adam_vector(const Task& task, const AdamDecays& decays, int64_t i, int64_t valid, F g) {
+  const F beta1 = set1(decays.first), beta2 = set1(decays.second);
   F first = load_some(task.first + i, valid), second = load_some(task.second + i, valid);
-  first = first * beta1 + g * (1.0f - kAdamBeta1);
-  second = second * beta2 + g * g * (1.0f - kAdamBeta2);
+  first = first * beta1 + g * (1.0f - decays.first);
+  second = second * beta2 + g * g * (1.0f - decays.second);
   const F denominator = square_root(second) * task.second_unbiased + kAdamEpsilon;
   store_some(task.first + i, valid, first);
   store_some(task.second + i, valid, second);
@@ -36,7 +36,9 @@ MIEN_INLINE void adam_vector(const Task& task, int64_t i, int64_t valid, F g) {
 }
 
 void adam(const AdamTask& task, int64_t begin, int64_t end) {
-  for (int64_t i = begin; i < end; i += W) adam_vector(task, i, end - i, load_some(task.gradient + i, end - i));
+  for (int64_t i = begin; i < end; i += W) {
+    adam_vector(task, task.decays, i, end - i, load_some(task.gradient + i, end - i));
+  }
 }
 
 void factored_adam(const FactoredAdamTask& task, int64_t begin, int64_t end) {
@@ -50,7 +52,7 @@ void factored_adam(const FactoredAdamTask& task, int64_t begin, int64_t end) {
           g = g + load_some(task.terms[t].rows + index * task.width + i, task.width - i) *
                       task.terms[t].columns_of(index, task.columns_count)[k];
         }
-        adam_vector(task, at + i, task.width - i, g);
+        adam_vector(task, {}, at + i, task.width - i, g);
       }
     }
   }

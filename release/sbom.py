@@ -34,6 +34,9 @@ _LICENCES = {
     "ray": "Apache-2.0",
     "fsspec": "BSD-3-Clause",
     "s3fs": "BSD-3-Clause",
+    "segno": "BSD-3-Clause",
+    "starlette": "BSD-3-Clause",
+    "uvicorn": "BSD-3-Clause",
 }
 """Licences of what mien asks for, beside those of `PACKAGES`."""
 

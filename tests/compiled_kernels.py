@@ -28,8 +28,8 @@ def signature(value: Any, path: tuple[int, ...], constants: dict[Any, Any]) -> A
         return TYPES[value.dtype]
     if isinstance(value, tuple):
         return tuple(signature(one, (*path, index), constants) for index, one in enumerate(value))
-    if value is None:
-        constants[path] = None
+    if value is None or (type(value) is int and value == 1):  # as Triton treats both at a launch
+        constants[path] = value
         return "constexpr"
     return "i32" if isinstance(value, int) else "fp32"
 
@@ -49,7 +49,7 @@ def launch(kernel: Any, programs: int, *arguments: Any, **named: Any) -> None:
 
 
 def main() -> None:
-    """Take one step on `meta` of each of three trainings, cover Gaussians, as footage of a mouth does, and move heads
+    """Take one step on `meta` of each of four trainings, cover Gaussians, as footage of a mouth does, and move heads
     and cameras."""
     mien.kernels.launch = launch  # before the files of kernels take it
     from mien.face.posing_gpu import head_poses
@@ -61,9 +61,10 @@ def main() -> None:
     with pytest.MonkeyPatch.context() as patched:
         pretend(patched)
         trainings = [default()]
-        for method in ("gaussian_avatars", "headgas"):
+        one: dict[str, Any] = {"frames_per_step": 1}
+        for method, changes in (("gaussian_avatars", {}), ("headgas", {}), ("mono_gaussian_avatar", one)):
             paper = PRESETS["paper"]
-            trainings.append((paper.config(method), paper.settings_of(method)))
+            trainings.append((replace(paper.config(method), **changes), paper.settings_of(method)))
         for config, settings in trainings:
             list(steps(without_features(config), replace(settings, **LONG), 1))
     like = torch.zeros(5, 4, 3, device="meta", requires_grad=True)

@@ -81,7 +81,7 @@ def test_faces_come_nearer_to_the_truth_and_the_avatar_stays() -> None:
 
 
 def test_what_was_stopped_goes_on_to_the_same_bytes(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("mien.training.alignment.ALIGNED_TOGETHER", 2)
+    monkeypatch.setattr("mien.training.alignment.ALIGNED_BETWEEN", 2)
     experiment = make_experiment(6)
     start, settings = astray(experiment.faces[0]), AlignmentSettings(resolution=32, iterations=2)
     begun: list[int] = []
@@ -92,7 +92,7 @@ def test_what_was_stopped_goes_on_to_the_same_bytes(tmp_path, monkeypatch) -> No
         done = itertools.count(1)
 
         def advance(amount: int = 1, status: str = "") -> None:
-            if len(begun) == 1 and next(done) == 2:
+            if len(begun) == 1 and next(done) == 4:
                 raise KeyboardInterrupt
 
         yield advance

@@ -116,6 +116,9 @@ def test_a_short_table_goes_on_where_it_stopped(tmp_path: Path, scene: Scene, mo
     tex = (out / "table.tex").read_text()
     assert "The Method & " in tex
     assert "# A table\n\nA paper." in (out / "table.md").read_text()
+    page = (out / "index.html").read_text()
+    assert "<h2>A table</h2>" in page
+    assert all(f"<td>{cell}</td>" in page for cell in table(out)["The Method"][:-1] if cell)
 
 
 def test_faces_are_fitted_where_the_paper_fits_them(tmp_path: Path, scene: Scene, monkeypatch) -> None:

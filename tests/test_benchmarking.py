@@ -3,6 +3,7 @@
 import itertools
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,12 +14,14 @@ import torch
 
 from known import known
 from mien import _native
+from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model
-from mien.lab.benchmarking import method_steps, step_parts, train_step
+from mien.lab.benchmarking import GPU_BENCHMARKS, method_steps, scaling, step_parts, train_step
 from mien.lab.benchmarking import render as render_benchmark
 from mien.lab.benchmarking.timing import BenchmarkRow, Timing, benchmark_row, thread_counts, time_function
+from mien.plugins import named
 from mien.training.trainer import step
 from refusals import complaint
 
@@ -51,18 +54,39 @@ def test_timing_counts_every_run_and_orders_its_figures() -> None:
 
 
 def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(render_benchmark, "COUNTS", (5, 20))
-    monkeypatch.setattr(render_benchmark, "SIZES", ((40, 30), (32, 32)))
+    monkeypatch.setattr(scaling, "COUNTS", (5, 20))
+    monkeypatch.setattr(scaling, "SIZES", ((40, 30), (32, 32)))
+    monkeypatch.setattr(scaling, "COUNT", 30)
+    small = train_step.training_case(load_face_model(), 2_000, 48, 40)
+    monkeypatch.setattr(scaling, "default_case", lambda face_model: (*small, train_step.SETTINGS))
     chart = tmp_path / "chart.svg"
     assert main(["bench", "scaling", "--json", "--seconds", "0.001", "--plot", str(chart)]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["machine"]["gflops"] > 0
     rows = [BenchmarkRow(**row) for row in shown["rows"]]
+    drawn, others = ([row for row in rows if row.name.startswith("rasterize_f") == which] for which in (True, False))
     wanted = itertools.product(((40, 30), (32, 32)), (5, 20), thread_counts())
-    assert {((row.width, row.height), row.gaussians, row.threads) for row in rows} == set(wanted)
+    assert {((row.width, row.height), row.gaussians, row.threads) for row in drawn} == set(wanted)
+    names = ["train_step_default", *(f"rasterize_{pictures}_at_once" for pictures in (1, 2, 4, 8))]
+    assert {row.name for row in others} == set(names)
+    assert {row.threads for row in others} >= set(thread_counts())
     assert all(0 < row.min_ms <= row.median_ms for row in rows)
-    assert all(words in chart.read_text() for words in ("rasterize forward, 1 thread", "40x30", "32x32"))
-    # Instruction sets are compared, and restored.
+    titles = ("rasterize forward, 1 thread", "40x30", "32x32", "30 Gaussians by threads", "rasterize 8 at once")
+    assert all(words in chart.read_text() for words in titles)
+
+
+def test_the_share_that_does_not_scale_is_amdahls() -> None:
+    def row(name: str, threads: int, ms: float) -> BenchmarkRow:
+        return replace(benchmark_row(name, 9, (64, 48), Timing(ms, ms, ms)), threads=threads)
+
+    rows = [row("whole", 1, 8.0), row("whole", 2, 5.0), row("whole", 4, 3.5), row("none", 1, 8.0), row("none", 4, 2.0)]
+    first, second = scaling.shares_that_do_not_scale([*rows, row("alone", 1, 8.0)])
+    assert "whole" in first
+    assert "25 % does not scale (2.29 times as fast with 4 threads)" in first
+    assert " 0 % does not scale (4.00 times" in second
+
+
+def test_instruction_sets_are_compared_and_restored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_benchmark, "COUNTS", ())
     monkeypatch.setattr(
         render_benchmark, "head_scene", lambda *_, head_scene=render_benchmark.head_scene: head_scene(9, 8, 8)
@@ -74,8 +98,8 @@ def test_scaling_as_json_with_a_chart(tmp_path: Path, monkeypatch: pytest.Monkey
     assert _native.rasterize_isa() == best
 
 
-MOST_OPERATORS = 330
-"""Most operators of PyTorch in a step of the default, nested ones included: a mean over steps with and without rare
+MOST_OPERATORS = 285
+"""Most operators of PyTorch for a frame of the default, nested ones included: a mean over steps with and without rare
 losses. PyTorch's own engine has 60 of them."""
 
 
@@ -103,10 +127,12 @@ def test_parts_of_a_step_add_up_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = step_parts.format_parts(rows)
     assert "a step, " in shown
     assert shown.count("ride_changes_backward") == 1
+    drawn = sum(row.ms for row in rows if row.operation in ("rasterize_views", "rasterize_views_backward"))
+    assert shown.endswith(f"{sum(row.ms for row in rows) / drawn:.2f} times")
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
         for _ in range(50):
             step(state, data, settings)
-    assert len(list(known(profile.events()))) / 50 < MOST_OPERATORS
+    assert len(list(known(profile.events()))) / 50 / GaussianAvatarsConfig().frames_per_step < MOST_OPERATORS
 
 
 @pytest.mark.parametrize(
@@ -132,13 +158,16 @@ def test_a_case_trains(made: Any, count: int, name: str, shape: tuple[int, ...])
 
 def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """The cases of a GPU run in float64 on the CPU, which executes all of their code but gsplat's."""
-    for room in (render_benchmark, train_step):
+    for room in (render_benchmark, train_step, method_steps):
         monkeypatch.setattr(room, "GPU_COUNTS", (60,))
-        monkeypatch.setattr(room, "PAPER_SIZES", {"": (24, 16)})
+        monkeypatch.setattr(room, *(("_SIZE", (24, 16)) if room is method_steps else ("PAPER_SIZES", {"": (24, 16)})))
     like = torch.zeros((), dtype=torch.float64)
     rows = [*render_benchmark.gpu_rows(like, 0.0), *train_step.gpu_rows(like, 0.0)]
     names = ["rasterize_forward", "rasterize_forward_backward", "train_step", "pose_and_render"]
     assert [row.name for row in rows] == names
+    for name in GPU_BENCHMARKS.keys() - {"gaussian_avatars"}:
+        rows += named(GPU_BENCHMARKS[name])(like, 0.0)
+    assert [row.name for row in rows[4:]] == ["train_step"] * 4
     assert all((row.gaussians, row.width, row.height) == (60, 24, 16) and row.min_ms > 0 for row in rows)
     if not torch.cuda.is_available():
         assert "--device cuda" in complaint(capsys, "bench", "render", "--device", "cuda")

@@ -86,6 +86,7 @@ def test_short_help_leaves_details_to_help_all(capsys: Told) -> None:
     ("bench scaling --plot chart.jpg", ("charts are written as .svg",)),
     ("bench train-step --parts --method headgas", ("--parts --method headgas",)),
     ("bench train-step --seconds=0", ("--seconds 0: give a number above 0",)),
+    ("bench train-step --method point_avatar", ("point_avatar", "a GPU only; add --device cuda")),
     ("evaluate x --protocol None", ("--protocol", "{insta,imavatar,nersemble", "['None']")),
     ("capture x --out y --capture.turn 45", ("'45'", "'--capture.turn'. Expected one of ('0', '90', '180', '270')")),
 ])  # fmt: skip

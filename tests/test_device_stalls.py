@@ -14,9 +14,10 @@ from launches import META, Launches, no_gsplat, pin
 from mien.adam import FactoredMoments
 from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.methods import METHODS
-from mien.avatar.settings import MethodConfig
+from mien.avatar.settings import MethodConfig, Progress
 from mien.training import PRESETS, TrainSettings, trainer
 from mien.training.checkpoint import TrainingState
+from mien.training.density_control import gradient, refill
 from mien.training.whole_head import side_views
 from plain_settings import plain_config, plain_run
 from toy_scene import toy_data, toy_face, toy_sequence
@@ -82,11 +83,11 @@ def steps(config: MethodConfig, settings: TrainSettings, count: int) -> Iterator
     face_model, sequence = toy_sequence(timesteps=3, size=32)
     state = trainer.start([sequence], face_model, config, settings, META)
     data = toy_data(sequence, settings, META)
-    for _ in range(count):
+    for number in range(count):
         with Constants() as constants, Launches() as launches:
             trainer.step(state, data, settings)
         # The first step moves to a GPU what stays there.
-        assert state.step == 1 or not launches.waits + constants.waits
+        assert number == 0 or not launches.waits + constants.waits
         yield state, launches.count
 
 
@@ -109,6 +110,30 @@ def test_a_step_of_training_waits_for_nothing(config: MethodConfig) -> None:
             assert (float(moments.step), moments.first.device.type) == (3, "meta")
 
 
+@pytest.mark.unchecked
+@pytest.mark.parametrize("method", ["gaussian_avatars", "headgas", "mono_gaussian_avatar"])
+def test_a_round_of_density_waits_once(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[int] = []
+
+    def counted(*masks: Tensor) -> list[int]:
+        reads.append(len(masks))
+        return [5, 3, 40][: len(masks)]
+
+    for module in (gradient, refill):
+        monkeypatch.setattr(module, "count_each", counted)
+    ((state, _),) = steps(without_features(PRESETS["paper"].config(method)), plain_run(**LONG), 1)
+    posed, density = state.avatar.pose(state.track.face(0)), state.density
+    assert density is not None
+    with Constants() as constants, Launches() as launches:
+        assert any(
+            density.adapt(state.avatar.store, posed, Progress(number, 1000, 0, 1.0), torch.Generator)
+            for number in range(1000)
+        )
+    assert not launches.waits + constants.waits
+    assert len(reads) == 1
+    assert len(state.avatar.store) == {1: 400, 3: 51}[reads[0]]
+
+
 def without_features(config: MethodConfig) -> MethodConfig:
     """The settings without the perceptual loss, whose network belongs to PyTorch."""
     photometric = config.photometric
@@ -116,9 +141,16 @@ def without_features(config: MethodConfig) -> MethodConfig:
 
 
 @pytest.mark.unchecked
-@pytest.mark.parametrize(("method", "most"), [("gaussian_avatars", 90), ("headgas", 90)])
-def test_a_step_of_a_paper_has_few_launches(method: str, most: int) -> None:
-    config = without_features(PRESETS["paper"].config(method))
+@pytest.mark.parametrize(
+    ("method", "changes", "most"),
+    [
+        ("gaussian_avatars", {}, 90), ("headgas", {}, 90), ("mono_gaussian_avatar", {"frames_per_step": 1}, 120),
+        ("mono_gaussian_avatar", {}, 285),
+    ],
+)  # fmt: skip
+def test_a_step_of_a_paper_has_few_launches(method: str, changes: dict[str, int], most: int) -> None:
+    """MonoGaussianAvatar has eight pictures a step until it has many points, and then one."""
+    config = replace(without_features(PRESETS["paper"].config(method)), **changes)
     settings = replace(PRESETS["paper"].settings_of(method), **LONG)
     counts = [count for _, count in steps(config, settings, 3)]
     assert max(counts[1:]) <= most, counts
@@ -131,12 +163,13 @@ def default() -> tuple[MethodConfig, TrainSettings]:
 
 @pytest.mark.unchecked
 def test_the_default_has_few_launches_and_side_views_at_most_twice_as_many() -> None:
+    """A step has two pictures, and every second one a side view as well."""
     config, settings = default()
     counts = [count for _, count in steps(without_features(config), settings, 9)]
-    with_views = counts[4::4]
-    assert max(counts[1:4] + counts[5:8]) <= 90, counts
-    assert max(with_views) <= 180, counts
-    assert min(with_views) > max(counts[1:4]), "side views are among them"
+    plain, with_views = counts[1::2], counts[2::2]
+    assert max(plain) <= 130, counts
+    assert max(with_views) <= 225, counts
+    assert min(with_views) > max(plain), "side views are among them"
 
 
 def test_a_copy_that_waits_is_found() -> None:

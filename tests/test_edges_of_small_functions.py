@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mien import runtime
+from mien import _native, runtime
 from mien.arrays import recycled
 from mien.camera import camera_from_fov
 from mien.capture.person.matte import guided_filter
@@ -163,3 +163,17 @@ def test_memory_is_used_again_but_never_while_somebody_holds_it() -> None:
     del view
     assert recycled(1024, 1025).data_ptr() == address
     assert (recycled(0, 3).shape, recycled(4, 0).shape) == ((0, 3), (4, 0))
+    for many in (_native.recycled, _native.recycled_twice):
+        with pytest.raises(ValueError, match="a tensor has at most 64 axes"):
+            many([1] * 129)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
+def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
+    values = torch.zeros(size)
+    assert _native.box_of_nonzero(values) == (0, 0, 0, 0)
+    for pixel in ((size[0] - 1, size[1] // 2), (size[0] // 3, size[1] - 1), (size[0] // 2, size[1] // 3)):
+        values[pixel] = 1e-6
+        rows, columns = values.nonzero().T
+        left, top = int(columns.min()), int(rows.min())
+        assert _native.box_of_nonzero(values) == (left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)

@@ -23,10 +23,12 @@ from mien import runtime, tracking
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.cli import COMMANDS, main
 from mien.face.loading import add_face_model
+from mien.formats.glb import write_glb
 from mien.media.video import probe_video
 from mien.tracking.settings import PhotometricSettings, TrackingSettings
 from needs import NO_NAMESPACE
 from shared_things import write_toy_workspace
+from test_glb import mesh_model
 from toy_scene import toy_face_model
 from viewer_alone import page_of
 from web_case import chromium, drawn_head, violations
@@ -90,8 +92,9 @@ OF_A_RUN = {
     "drive": "{toy} --run toy --by {toy} --out {out}/driven.mp4", "export": "{demo} --out {out}/me.html",
     "export-dataset": "{toy} --out {out}/data --format insta", "import": "{exported} --out {out}/imported",
     "face-models": "--json", "bench": "render --seconds 0.01 --json", "licenses": "--json", "plugins": "--json",
+    "check": "{glb}",
 }  # fmt: skip
-"""Lines of every command but two: `demo` makes the subject, and `view` has a test of its own."""
+"""Lines of every command but three: `demo` makes the subject, and `studio` and `view` have tests of their own."""
 _FLAGS, _SET_FLAGS, _UP = 0x8913, 0x8914, 1
 
 
@@ -111,7 +114,7 @@ def run_all(server: ForkServer, lines: dict[str, str], **given: object) -> None:
 
 
 def test_no_command_needs_a_network(offline: Path, fork_server: ForkServer, tmp_path: Path) -> None:
-    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "view"} == set(COMMANDS)
+    assert {*OF_A_VIDEO, *OF_A_RUN, "demo", "studio", "view"} == set(COMMANDS)
     video = offline / VIDEO
     (tmp_path / "table.csv").write_text(f"video\n{video}\n")
     table, stub = tmp_path / "table.csv", " ".join(PROGRAM)
@@ -125,7 +128,9 @@ def test_no_command_needs_a_network_once_there_is_a_run(offline, fork_server, tm
     add_face_model(toy_face_model(), tmp_path / "toy.npz", "none")
     lines = {"export": "{toy} --out {exported} --format gaussian-avatars"}
     run_all(fork_server, lines, toy=toy, exported=exported)
-    run_all(fork_server, OF_A_RUN, demo=offline, toy=toy, exported=exported, out=tmp_path)
+    write_glb(tmp_path / "me.glb", drawn_head(50), mesh_model(drawn_head(50)), 32)
+    given = {"demo": offline, "toy": toy, "exported": exported, "out": tmp_path, "glb": tmp_path / "me.glb"}
+    run_all(fork_server, OF_A_RUN, **given)
     runtime.write_portable(tmp_path / "me.mien", drawn_head(50))
     viewer = fork_server.call("test_end_to_end:view_alone", str(tmp_path / "me.mien"))
     assert viewer.wait() == 0, viewer.stderr
@@ -139,13 +144,17 @@ def test_a_capture_by_litert_is_made_without_a_network(offline: Path, fork_serve
 
 
 def view_alone(avatar: str) -> None:
-    """Raise the loopback of a new network namespace, show an avatar, and print the viewer's page."""
+    """Show an avatar without a route to anywhere, and print the viewer's page."""
     assert leave_network()
+    raise_loopback()
+    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
+
+
+def raise_loopback() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         asked = struct.pack("16sH14x", b"lo", 0)
         _, flags = struct.unpack("16sH14x", fcntl.ioctl(any_socket, _FLAGS, asked))
         fcntl.ioctl(any_socket, _SET_FLAGS, struct.pack("16sH14x", b"lo", flags | _UP))
-    print(page_of([sys.executable, "-m", "mien.cli", "view", avatar, "--port", "0"]))
 
 
 ROOT = Path(__file__).parents[1]
@@ -230,7 +239,7 @@ def test_api_page(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert "Gaussians" in capsys.readouterr().out
 
 
-DEMO = ("--seconds", "0.8", "--steps", "60")
+DEMO = ("--seconds", "0.8", "--steps", "120")
 FRAMES = 12
 """Number of frames of the clip."""
 VIDEO = "synthetic-0-0.8s.mp4"

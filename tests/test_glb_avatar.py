@@ -102,10 +102,11 @@ def test_foreign_and_damaged_files_are_refused(glb: Path, tmp_path: Path) -> Non
     for told, *edits in (
         ("has no avatar of mien", lambda content: content.pop("extensions"),
          lambda content: content.update(extensions=[1]), lambda content: content["extensions"].update({EXTENSION: 3})),
-        ("has version 9 of MIEN_gaussian_avatar, expected 1", extension(version=9)),
-        ("has format 'other' version 1", extension(avatar={"format": "other", "version": 1})),
-        ("does not match its checksum", extension(tensors={}), avatar(sha256="0")),
-        ("is damaged|checksum", tensor(bufferView=0)),
+        ("version is 9; 1 is expected", extension(version=9)),
+        ("avatar names it 0 times", extension(avatar={"format": "other", "version": 1})),
+        ("does not match its checksum", avatar(sha256="0")),
+        ("avatar names the array", extension(tensors={})),
+        ("its bufferView has|belongs to another", tensor(bufferView=0)),
         ("is damaged, or not a .glb file", lambda content: content.update(extras=nested(90))),
         ("is damaged", extension(avatar=[]), extension(avatar={}), extension(tensors=[]), tensor(shape=[-1, 3]),
          tensor(shape=[2**40, 3]), tensor(shape="3"), tensor(dtype="object"), tensor(dtype=["float32"]),
@@ -116,6 +117,51 @@ def test_foreign_and_damaged_files_are_refused(glb: Path, tmp_path: Path) -> Non
             refuses(told, read_glb_avatar, path)
     path.write_bytes(b"glTF is not here")
     refuses("is damaged, or not a .glb file", read_glb_avatar, path)
+
+
+def test_check_tells_each_mistake(glb: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Arrays first, all of them; then what they mean. A file under the other name of the extension is read as well."""
+    path = tmp_path / "a.glb"
+
+    def told(edit: Any) -> list[str]:
+        rewritten(glb, path, edit)
+        code, lines = main(["check", str(path)]), capsys.readouterr()
+        assert code == (2 if "mistakes" in lines.err else 0)
+        return lines.out.splitlines()
+
+    def renamed(content: Any) -> None:
+        content["extensions"]["EXT_gaussian_avatar"] = content["extensions"].pop(EXTENSION)
+
+    def many(content: Any) -> None:
+        found = content["extensions"][EXTENSION]
+        tensors, baked = found["tensors"], found["avatar"]["content"]["baked"]
+        tensors["baked.means"]["shape"][0] += 1
+        tensors["baked.face_index"]["dtype"] = "int64"
+        tensors["baked.attributes.sh"]["bufferView"] = 99999
+        tensors["more"] = {"dtype": "float32", "shape": [0]}
+        baked["faces"] = {"tensor": "gone"}
+        found["version"] = 2
+
+    for edit in (lambda content: None, renamed):
+        assert told(edit) == [f"{path}: follows docs/spec/README.md"]
+    n = len(read_glb_avatar(glb).baked.attributes.opacity_logits)
+    assert told(many) == [
+        "version is 2; 1 is expected", "tensors.baked.attributes.sh: list index out of range",
+        "tensors.baked.face_index: dtype is 'int64'; float32 or int32 is expected",
+        f"tensors.baked.means: its shape [{n + 1}, 3] needs {12 * n + 12} bytes, and its bufferView has {12 * n}",
+        "avatar names the array gone, which tensors lacks", "tensors.baked.faces: avatar names it 0 times",
+        "tensors.more: avatar names it 0 times",
+    ]  # fmt: skip
+    data = bytearray(glb.read_bytes())
+    read = read_glb(glb)
+    view = read.content["extensions"][EXTENSION]["tensors"]["baked.means"]["bufferView"]
+    at = len(data) - len(read.buffer) + read.content["bufferViews"][view]["byteOffset"]
+    data[at : at + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(data)
+    assert main(["check", str(path)]) == 2
+    checksum, number = capsys.readouterr().out.splitlines()
+    assert "does not match its checksum" in checksum
+    assert "baked.means" in number
 
 
 WIDE = 256

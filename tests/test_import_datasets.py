@@ -269,7 +269,7 @@ def test_raw_recordings_of_nersemble_become_an_avatar(rig: SyntheticScene, tmp_p
     off = tracking.face.head_translation - rig.tracking().face.head_translation
     assert float(off.norm(dim=1).median()) < 0.02
     assert (
-        main(["train", str(root), "--run", "a", "--steps", "20", *SMALL, *PLAIN, "--training.record-every", "2"]) == 0
+        main(["train", str(root), "--run", "a", "--steps", "40", *SMALL, *PLAIN, "--training.record-every", "2"]) == 0
     )
     psnr = read_curves(root / "runs/a")["psnr"]
     assert psnr[-3:].mean() > psnr[:3].mean() + 1

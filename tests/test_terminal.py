@@ -24,6 +24,8 @@ from mien.machine import progress, system
 from mien.machine.progress import current_stage, progress_bar, say, stages
 from mien.machine.terminal import plain_name, printable, show
 from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
+from mien.pipeline import stage_times
+from mien.pipeline.stage_times import StageTimes
 from needs import find_test_data
 from refusals import complaint, refuses
 from shared_things import write_toy_workspace
@@ -167,6 +169,28 @@ def test_stages_are_told(capsys) -> None:
         assert current_stage() == "training"
     assert current_stage() is None
     assert capsys.readouterr().err == "stage 2 of 2 (training)\n"
+
+
+def test_each_stage_has_its_seconds_and_cores_and_one_with_nothing_to_do_keeps_them(monkeypatch, tmp_path) -> None:
+    clock, processor = Clock(), [0.0]
+    monkeypatch.setattr(stage_times, "time", clock)
+    monkeypatch.setattr(stage_times, "peak_memory_mb", lambda: 2000.0)
+    monkeypatch.setattr(stage_times.os, "times", lambda: (processor[0] / 2, 0.0, processor[0] / 2, 0.0, 0.0))
+    for capture, training in ((10.0, 20.0), (0.5, 15.0)):
+        times = StageTimes(tmp_path / "stages.json")
+        with stages("capture", "training") as tell, times.one_by_one(tell) as begin:
+            for name, seconds in (("capture", capture), ("training", training)):
+                begin(name)
+                clock.now += seconds
+                processor[0] += 1.5 * seconds
+    assert StageTimes(tmp_path / "stages.json").seconds() == {"capture": 10.0, "training": 15.0}
+    assert times.told() == "capture 10 s on 1.5 cores, training 15 s on 1.5 cores; 2.1 GB of memory"
+
+
+def test_times_that_cannot_be_read_are_measured_anew(tmp_path) -> None:
+    for content in ('{"format": "mien.stage_times", "version": 1, "stages": {"capture": {"seconds": "x"}}}', "[]"):
+        (tmp_path / "stages.json").write_text(content)
+        assert StageTimes(tmp_path / "stages.json").stages == {}
 
 
 @pytest.mark.parametrize(("durations", "status", "told"), [

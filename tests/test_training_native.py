@@ -67,13 +67,17 @@ class Kernel:
     compare: Callable[[int, Tensor, Tensor], None]
 
 
-def adam(given: Tensors, native: bool) -> Tensors:
+def adam_inputs(count: int) -> Tensors:
+    return [0.1 * random(count, seed=1), random(count, seed=2).square(), random(count, seed=3), random(count)]
+
+
+def adam(given: Tensors, native: bool, frames: int) -> Tensors:
     def update() -> updates.Update:
         first, second, values, gradient = (tensor.clone() for tensor in given)
         return updates.Update(values, gradient, Moments(first, second, torch.tensor(3.0)), 0.01)
 
     one = update()
-    updates.update_all([one, update()]) if native else updates.update_reference(one)
+    updates.update_all([one, update()], frames) if native else updates.update_reference(one, frames=frames)
     return [one.values, one.moments.first, one.moments.second, one.moments.step]
 
 
@@ -307,8 +311,8 @@ def compare_activated(index: int, own: Tensor, truth: Tensor) -> None:
 COUNTS, PICTURES = (0, 1, 15, 16, 4097), ((1, 1), (7, 5), (40, 130), (200, 301))
 KERNELS = {
     # If the second moment is small, an update is large (up to 10), and its last digits differ in float32.
-    "adam": Kernel(lambda n: [0.1 * random(n, seed=1), random(n, seed=2).square(), random(n, seed=3), random(n)],
-                   adam, COUNTS, 20_000, near(1e-5, 1e-5)),
+    **{f"adam{frames}": Kernel(adam_inputs, partial(adam, frames=frames), COUNTS, 20_000, near(1e-5, 1e-5))
+       for frames in (1, 2)},
     "factored": Kernel(factored_inputs, factored, ((1, 1, 0), (16, 3, 0), (19, 1, 4), (32, 2, 0)), (32, 2, 0),
                        near(1e-5, 1e-6)),
     "published": Kernel(published_inputs, published, ((1, 1, 0), (16, 1, 3), (19, 3, 0), (32, 2, 4)), (32, 1, 4),
@@ -387,14 +391,3 @@ def test_adam_takes_another_epsilon_and_what_is_not_dense_by_the_reference() -> 
         of_a_group.grad = torch.full((4, 3), 1e-9)
         updates.Adam().step([ParameterGroup("one", {"one": of_a_group}, Rate(0.1), epsilon=epsilon)], Progress(0, 1))
         torch.testing.assert_close(of_a_group.detach(), values, rtol=1e-4, atol=0)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 130)])
-def test_box_of_nonzero(isa: str, size: tuple[int, int]) -> None:
-    values = torch.zeros(size)
-    assert _native.box_of_nonzero(values) == (0, 0, 0, 0)
-    for pixel in ((size[0] - 1, size[1] // 2), (size[0] // 3, size[1] - 1), (size[0] // 2, size[1] // 3)):
-        values[pixel] = 1e-6
-        rows, columns = values.nonzero().T
-        left, top = int(columns.min()), int(rows.min())
-        assert _native.box_of_nonzero(values) == (left, top, int(columns.max()) + 1 - left, int(rows.max()) + 1 - top)

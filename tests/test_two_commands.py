@@ -12,6 +12,7 @@ from capture_helpers import tree_bytes
 from forked import Forked, ForkServer
 from mien.cli import main
 from mien.disk.locks import lock_file
+from mien.pipeline.stage_times import FILE_NAME, StageTimes
 from other_process import Holder
 from refusals import complaint
 from two_commands import RANK, Studio, beside, toy_studio
@@ -37,6 +38,12 @@ def studio(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Studio:
     folder = ["--out", str(made.avatar_folder), "--format", "gaussian-avatars"]
     assert main(["export", str(made.root), "--run", "alone", *folder]) == 0
     return made
+
+
+def test_create_keeps_what_each_stage_took(studio: Studio) -> None:
+    times = StageTimes(studio.root / FILE_NAME)
+    assert list(times.stages) == ["capture", "tracking", "alignment", "training", "scoring"]
+    assert times.stages["training"].processor > 0
 
 
 def commands_that_write(studio: Studio, folder: Path) -> list[tuple[Path, str]]:

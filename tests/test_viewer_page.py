@@ -29,10 +29,10 @@ from viser.transforms import SO3
 from forked import ForkServer
 from mien import runtime
 from mien.errors import UserError
-from mien.viewer.access import Door
+from mien.viewer.access import Door, listen
 from mien.viewer.files import SCREENSHOT_HEIGHT
 from mien.viewer.panel import filmed_from
-from mien.viewer.server import Serving, listen
+from mien.viewer.server import Serving
 from mien.viewer.session import Session
 from test_viewer import clip_of
 from web_case import browse, drawn_head, until

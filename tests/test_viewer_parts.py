@@ -53,7 +53,7 @@ def test_only_loopback_goes_without_a_token_and_strange_hosts_and_origins_are_re
     for headers in ({}, *({"Host": host} for host in strange), {"Origin": "http://["}, *from_elsewhere):
         answer = door.answer("/", headers)
         assert answer is not None, headers
-        assert answer.status_code == 403
+        assert answer.status == 403
 
 
 def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -> None:
@@ -74,7 +74,7 @@ def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -
     assert door.token != Door.of("0.0.0.0").token
     here = {"Host": "me.example:80"}
     first = known(door.answer(f"/?token={door.token}", here))
-    assert (first.status_code, first.headers["Location"]) == (303, "index.html")
+    assert (first.status, first.headers["Location"]) == (303, "index.html")
     given, *attributes = first.headers["Set-Cookie"].split("; ")
     assert {"HttpOnly", "SameSite=Strict"} <= set(attributes)
     assert door.answer("/", {**here, "Cookie": f"a=b; {given}"}) is None
@@ -83,7 +83,7 @@ def test_a_token_becomes_a_cookie_also_behind_a_proxy_with_a_path_of_its_own() -
     for path, headers in (("/?token=", {}), ("/", {"Cookie": given[:-1]}), ("/", evil), ("/", {"Cookie": "é=[,"})):
         answer = door.answer(path, {**here, **headers})
         assert answer is not None, (path, headers)
-        assert answer.status_code == 403
+        assert answer.status == 403
     assert door.address("::1", 7).startswith("http://[::1]:7/?token=")
 
 
@@ -224,7 +224,9 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return files
 
 
-def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_states_are_written_from_time_to_time(
+    started: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
     """What cannot be shown is said once."""
     now = [100.0]
     monkeypatch.setattr(view_training.time, "monotonic", lambda: now[0])
@@ -245,9 +247,14 @@ def test_states_are_written_from_time_to_time(started: list[Path], monkeypatch: 
         other(new_avatar("headgas", variant="delta"))
     other.close()
     told = capsys.readouterr().err
-    assert told.count("--view: the avatar cannot be shown") == 1
-    assert "training goes on without a viewer" in told
+    assert told.count("the growing avatar cannot be shown") == 1
+    assert "training goes on without that" in told
     assert len(started) == 1
+    growing = TrainingView("toy", toy_camera(32), tmp_path / "growing.mien", viewer=False)
+    growing(avatar)
+    growing.close()
+    assert (tmp_path / "growing.mien").is_file(), "it stays"
+    assert len(started) == 1, "nobody asked for a viewer"
 
 
 def test_a_watched_training_has_the_same_bytes(started: list[Path], tmp_path: Path, monkeypatch) -> None:

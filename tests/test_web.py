@@ -32,12 +32,13 @@ from toy_scene import toy_camera
 from web_case import WEB, drawn_head, faces_of, likeness, node, picture, pose_by_node, rendered, script, stored
 
 EQUAL = 1e-5
+STUDIO = Path(web_page.__file__).parents[1] / "studio"
 
 
 def test_what_is_committed_is_that_of_a_fresh_build_and_small(built: Path) -> None:
     for name, committed in (
         ("page.html", web_page.TEMPLATE), ("webgpu_page.js", web_page.WEBGPU), ("webcam.html", webcam.TEMPLATE),
-        ("microphone.html", web_page.MICROPHONE),
+        ("microphone.html", web_page.MICROPHONE), *((name, STUDIO / name) for name in ("studio.html", "phone.html")),
     ):  # fmt: skip
         fresh = (built / name).read_text() == committed.read_text()
         assert fresh, f"{name} is older than web/: run `make web`, commit it"

@@ -1,7 +1,6 @@
-"""The element <mien-avatar>, the playground, the example in three.js, and the starter with the package of npm."""
+"""The element <mien-avatar>, the playground, and the starter with the package of npm."""
 
 import json
-import math
 import shutil
 import subprocess
 import tarfile
@@ -9,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import web_case as web
 from mien import runtime
-from mien.camera import camera_from_fov, look_at
 from mien.formats.glb import write_glb
 from mien.formats.page import write_packed
 from test_glb import mesh_model
@@ -39,7 +36,6 @@ viewer.draw();
 return viewer.canvas.toDataURL();
 """
 PIXELS = "const { width, height } = avatar.viewer.canvas; avatar.style = ''; return width * height;"
-PAGE = '<link rel="icon" href="data:,"><canvas id="scene" style="width: 400px; height: 400px"></canvas>'
 ONE_BY_ONE = "for (const [name, value] of [['jawOpen', 0.7], ['eyeBlinkLeft', 1]]) avatar.setExpression(name, value);"
 STILL = """
 avatar.removeAttribute("idle");
@@ -96,51 +92,6 @@ def test_the_element_shows_an_avatar(site: Path) -> None:
     assert all(request.startswith(address) for request in told["requests"])
     # Once for the page, and once when it came back.
     assert sum(request.endswith("me.packed") for request in told["requests"]) == 2
-
-
-def test_an_avatar_stands_in_a_scene_of_three(site: Path) -> None:
-    """It is seen by the scene's camera, hides what is behind it, and is hidden by what is before it."""
-    web.bundle(EXAMPLES / "three" / "main.js", site / "main.bundle.js", f"--alias:mien-web={site / 'mien.js'}")
-    (site / "three.html").write_text(PAGE)
-    begin = """
-      const { start } = await import("./main.bundle.js");
-      const file = new Uint8Array(await (await fetch("me.packed")).arrayBuffer());
-      window.made = await start(document.getElementById("scene"), file);
-    """
-    shot = "made.look(%g); return document.getElementById('scene').toDataURL();"
-    hidden = "for (const box of Object.values(made.boxes)) box.visible = false;"
-    places = """
-      const { camera, boxes } = made;
-      return Object.values(boxes).map((box) => { const p = box.position.clone().project(camera); return [p.x, p.y]; });
-    """
-    steps = [web.script(begin, shot % 0), web.script(places), web.script(hidden, shot % 0), web.script(shot % 20)]
-    with web.served(site) as address:
-        told = web.browse(f"{address}/three.html", steps, size=(600, 600))
-    assert told["messages"] == []
-    scene, (front, _), alone, turned = told["results"]
-    scene, alone, turned = (web.picture(address)[..., :3] for address in (scene, alone, turned))
-    row, column = round((1 - front[1]) / 2 * 400), round((1 + front[0]) / 2 * 400)
-    assert scene[row, column, 0] > 2 * scene[row, column, 2], "the red box before the head"
-    assert np.abs(scene - alone)[row, column].max() > 0.1
-    # The whole blue box would take 0.16 of the picture.
-    assert 0.03 < (scene[..., 2] > scene[..., 0] + 0.3).mean() < 0.11
-    exact = runtime.Avatar(web.drawn_head(2000, rank=2))
-    moved = runtime.Gaussians(**{**vars(exact.pose()), "T_world_local": np.eye(4, dtype=np.float32)})
-    (expected, alpha), (aside, _) = (
-        exact.render(moved, scene_camera(turn), background=(0xDD / 255, 0xE4 / 255, 0xEA / 255))
-        for turn in (0.0, math.radians(20))
-    )
-    assert web.psnr(alone, expected) >= 40
-    assert web.psnr(turned, aside) >= 40
-    # Where the head is opaque, the box behind it changes nothing.
-    near_blue = np.s_[:200, :200]
-    assert np.abs(scene - alone).max(-1)[near_blue][alpha[near_blue] > 0.99].max() < 0.03
-
-
-def scene_camera(turn: float) -> runtime.Camera:
-    eye = torch.tensor([0.8 * math.sin(turn), 0.05, 0.8 * math.cos(turn)])
-    camera = camera_from_fov(math.radians(25), 400, 400, look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])))
-    return runtime.Camera(camera.K.numpy(), camera.viewmat.numpy(), 400, 400)
 
 
 DROP = """

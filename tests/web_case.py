@@ -80,7 +80,10 @@ def build(folder: Path) -> Path:
 
 def bundle(source: Path, out: Path, *options: str) -> None:
     command = [node(), str(WEB / "node_modules" / "esbuild" / "bin" / "esbuild"), str(source), "--bundle"]
-    subprocess.run([*command, "--format=esm", f"--outfile={out}", *options], check=True, capture_output=True)
+    command += ["--format=esm", f"--outfile={out}", *options]
+    # A fresh build lies elsewhere than the packages.
+    packages = os.environ | {"NODE_PATH": str(WEB / "node_modules")}
+    subprocess.run(command, check=True, capture_output=True, env=packages)
 
 
 class _Server:
@@ -168,8 +171,8 @@ def browse(
     return ask_node(page=address, **told)
 
 
-def until(done: Callable[[], bool]) -> None:
-    ends = time.monotonic() + PATIENCE_SECONDS
+def until(done: Callable[[], bool], seconds: float = PATIENCE_SECONDS) -> None:
+    ends = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < ends, "it never came"
         time.sleep(0.01)

@@ -33,10 +33,9 @@ _SCENE = """(async () => {
   const { start } = await import("./main.bundle.js");
   const file = new Uint8Array(await (await fetch("me.packed")).arrayBuffer());
   window.made = await start(document.getElementById("scene"), file);
-  made.head.viewer.setExpression("mouthSmileLeft", 0.7);
-  made.head.viewer.setExpression("mouthSmileRight", 0.7);
-  made.look(15);
-  %s
+  made.left.pause();
+  made.left.setFace({ mouthSmileLeft: 0.7, mouthSmileRight: 0.7 });
+  for (let i = 0; i < 4; ++i) await new Promise(requestAnimationFrame);
 })()"""
 _MESH = """
 import * as THREE from "three";
@@ -74,8 +73,8 @@ def shoot(address: str, script: str, path: Path) -> None:
 
 def bundle(source: Path, out: Path) -> None:
     """Bundle a script with three.js and the package."""
-    esbuild, dist = WEB / "node_modules" / ".bin" / "esbuild", WEB / "dist" / "mien.js"
-    options = ["--bundle", "--format=esm", f"--alias:mien-web={dist}", f"--outfile={out}"]
+    esbuild = WEB / "node_modules" / ".bin" / "esbuild"
+    options = ["--bundle", "--format=esm", f"--outfile={out}"]
     subprocess.run([str(esbuild), str(source), *options], check=True, capture_output=True)
 
 
@@ -99,7 +98,7 @@ def make(workspace: Path, run: str | None) -> None:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             address = f"http://127.0.0.1:{server.server_address[1]}"
             mesh = 'await (await import("./mesh.bundle.js")).start(document.getElementById("scene"));'
-            shots = {"element": _LOADED, "three": _SCENE % _SHOT, "mesh": f"(async () => {{ {mesh} {_SHOT} }})()"}
+            shots = {"element": _LOADED, "three": _SCENE, "mesh": f"(async () => {{ {mesh} {_SHOT} }})()"}
             for what, script in shots.items():
                 page = "element" if what == "element" else "three"
                 shoot(f"{address}/{page}.html", script, site / f"{what}.png")

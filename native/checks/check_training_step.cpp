@@ -97,7 +97,7 @@ void check_adam() {
     for (int64_t count : {0, 1, 15, 16, 17, 40000}) {
       for (int j = 0; j < 4; ++j) arrays.push_back(j == 3 ? random.uniform(count) : random.normal(count));
       Floats* own = &arrays[arrays.size() - 4];
-      tasks.push_back({own[0].data(), own[1].data(), own[2].data(), own[3].data(), count, 1e-3f, 1.5f});
+      tasks.push_back({own[0].data(), own[1].data(), own[2].data(), own[3].data(), count, 1e-3f, 1.5f, {}});
     }
     mien::adam_update(tasks.data(), static_cast<int>(tasks.size()));
     for (const Floats& array : arrays) CHECK(all_finite(array));

@@ -1,6 +1,7 @@
 """Adam's state for one tensor, which training and the paper's tracking share. Each has its own update."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from threading import local
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -65,16 +66,28 @@ class FactoredTerm(NamedTuple):
     places: Int[Tensor, " n"] | None = None
 
 
-@dataclass(eq=False)
 class FactoredGradient:
     """The gradient of a tensor [n, k, f] as a sum of outer products, so that it is never made. Mutable.
 
-    A backward pass adds to it and the optimiser clears it, like `Tensor.grad`.
+    A backward pass adds to it and the optimiser clears it, like `Tensor.grad`. Each thread has its own terms, so that
+    their order does not depend on which backward pass is the faster one.
     """
 
-    terms: list[FactoredTerm] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._of_thread = local()
+
+    @property
+    def terms(self) -> list[FactoredTerm]:
+        """The terms that backward passes of this thread added."""
+        if not hasattr(self._of_thread, "terms"):
+            self._of_thread.terms = []
+        return self._of_thread.terms
+
+    def __reduce__(self) -> tuple[type["FactoredGradient"], tuple[()]]:
+        """A copy has no terms: those belong to a thread and a step."""
+        return FactoredGradient, ()
 
     def take(self) -> list[FactoredTerm]:
         """Return the terms, and clear them."""
-        terms, self.terms = self.terms, []
+        terms, self._of_thread.terms = self.terms, []
         return terms

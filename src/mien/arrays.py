@@ -31,6 +31,14 @@ def recycled_like(tensor: Tensor) -> Tensor:
     return _native.recycled(tensor.shape)
 
 
+def recycled_twice(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Two tensors as that of `recycled` in the same memory: one to return from a forward pass, one to keep.
+
+    What an operation of autograd returns has a history. If the operation kept it, it would keep itself.
+    """
+    return _native.recycled_twice(shape)
+
+
 def is_native(*tensors: Tensor) -> bool:
     """Whether the native core can compute with these tensors: float32, or integers, on a CPU."""
     return all(
@@ -117,6 +125,16 @@ def own_derivative(loss: Float[Tensor, ""]) -> Tensor | None:
 def times(gradient: Tensor, factor: Float[Tensor, ""]) -> Tensor:
     """The gradient times a factor; itself if that is 1. It knows `ONE` without reading it."""
     return gradient if factor is ONE or float(factor) == 1 else gradient * factor
+
+
+def sums(first: Sequence[Tensor], second: Sequence[Tensor]) -> list[Tensor]:
+    """The sums of tensors of equal shapes, in memory of their own: one pass of the core for all that it can take."""
+    if not is_native(*first, *second) or any(tensor.dtype != torch.float32 for tensor in first):
+        return [a + b for a, b in zip(first, second, strict=True)]
+    found = [recycled_like(tensor) for tensor in first]
+    one, other = ([tensor.contiguous() for tensor in own] for own in (first, second))
+    _native.add_arrays(unpacked(*one), unpacked(*other), unpacked(*found))
+    return found
 
 
 def clear_rows(chosen: Bool[Tensor, " n"], tensors: Sequence[Tensor]) -> None:

@@ -25,6 +25,7 @@ from mien.plugins import missing_package
 GROUPS = {
     "Make an avatar": {
         "demo": "the whole path on a synthetic head, in minutes: start here",
+        "studio": "film yourself in a browser, watch the avatar grow, take it away",
         "create": "video -> avatar, page, film and report: all stages in one command",
         "capture": "a video (or a folder of pictures) -> frames, mattes, landmarks",
         "track": "capture -> face parameters, cameras, overlay video",
@@ -48,6 +49,7 @@ GROUPS = {
         "face-models": "list the face models and bake them ahead of time",
         "licenses": "what is installed, under which terms, and what that means",
         "plugins": "what other packages add: methods, formats and datasets, and their faults",
+        "check": "a .glb file with an avatar -> its mistakes against docs/spec, a line each",
     },
 }
 """The sub-commands with their summaries, as `mien --help` lists them.

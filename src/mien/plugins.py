@@ -22,6 +22,7 @@ _EXTRAS = {
     "video": "av",
     "create": "torch filelock cv2 mediapipe ai_edge_litert anny stlpips_pytorch matplotlib PIL jinja2 scipy zstandard",
     "viewer": "viser",
+    "studio": "starlette uvicorn segno",
     "usd": "pxr",
     "cuda": "gsplat",
     "batch": "submitit ray fsspec s3fs",
@@ -29,12 +30,9 @@ _EXTRAS = {
 EXTRA_OF = {module: extra for extra, modules in _EXTRAS.items() for module in modules.split()}
 """Name of a module -> the extra that installs it."""
 PACKAGE_OF = {
-    "cv2": "opencv-python-headless",
-    "ai_edge_litert": "ai-edge-litert",
-    "stlpips_pytorch": "stlpips-pytorch",
-    "PIL": "pillow",
-    "pxr": "usd-core",
-}
+    "cv2": "opencv-python-headless", "ai_edge_litert": "ai-edge-litert", "stlpips_pytorch": "stlpips-pytorch",
+    "PIL": "pillow", "pxr": "usd-core",
+}  # fmt: skip
 """Name of a module -> name of its package, if that is another."""
 _OF_FILES = ("render", "view", "drive")
 """Sub-commands that need nothing but PyAV to write a film of a .mien file. Others need all of `create` soon after."""

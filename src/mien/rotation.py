@@ -1,5 +1,6 @@
 """Rotations: axis-angle, matrices and wxyz quaternions, batched over leading axes."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,17 +11,29 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.arrays import recycled_like, unpacked
+from mien.machine.devices import upload
 
+# Each column has one entry, so that no sum is rounded.
+_SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]])
+"""From a vector to its cross-product matrix, by rows."""
 # Below this squared angle (radians), the closed forms lose digits and their Taylor series take over.
 _SMALL_ANGLE_SQUARED = 1e-8
 
 
+@cache
+def _constant(values: bytes, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    constant = torch.tensor(np.frombuffer(values).reshape(shape), dtype=dtype)
+    return upload(constant, torch.empty(0, dtype=dtype, device=device))
+
+
+def _like(values: np.ndarray, like: Tensor) -> Tensor:
+    """A constant with the dtype and device of a tensor, made once."""
+    return _constant(values.astype(float).tobytes(), values.shape, like.dtype, like.device)
+
+
 def skew(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Cross-product matrices: `skew(a) @ b == cross(a, b)`."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
-    return torch.stack(rows, dim=-1).reshape(*vectors.shape[:-1], 3, 3)
+    return (vectors @ _like(_SKEW, vectors)).unflatten(-1, (3, 3))
 
 
 def matrix_from_axis_angle(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -32,8 +45,7 @@ def matrix_from_axis_angle(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "
     sine = torch.where(small, 1 - squared / 6, angle.sin() / angle)
     cosine = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
     cross = skew(axis_angle)
-    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
-    return identity + sine * cross + cosine * (cross @ cross)
+    return _like(np.eye(3), axis_angle) + sine * cross + cosine * (cross @ cross)
 
 
 def axis_angle_from_matrix(matrices: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:

@@ -297,7 +297,8 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
         own := c.make_face_activations(*face_activations(c)), *c.given("j", "3", "3", "3"),
         np.zeros(c.native.activation_shape(own), F32)],
     "adam_update": lambda c: [[
-        Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01) for _ in range(c.size("a"))]],
+        Call(c.native, c.rng).AdamTask("n d", "n d", "n d", "+n d", steps(c), 0.01, 2) for _ in range(c.size("a"))]],
+    "add_arrays": lambda c: [c.given("n", "n 3"), c.given("n", "n 3"), c.given("=n", "=n 3")],
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
     "align_mesh": lambda c: sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in c.given(
         c.AlignDerivatives("V 3 p", "=p p", "=p"), "=H W 3", "=H W 3"))),
@@ -326,6 +327,7 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "make_face_model": make_face_model,
     "make_rig_topology": lambda c: c.given(c.size("v"), "<v t 3", "<t n"),
     "mean_squared_difference": lambda c: c.given("H W 3", "<256 H W 3:u1"),
+    "keep_loops_serial": lambda c: [c.flag()],
     "mesh_loss": mesh_loss,
     "observe_view": lambda c: c.given((2.0, 3.0), "n 2", "<3 n:i4", "n", "=n", "=n", "=n:i4", "=n"),
     "photometric_loss": lambda c: c.given(
@@ -340,6 +342,8 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "rasterize_views": lambda c: [views(c), c.flag(0.7)],
     "rasterize_views_backward": rasterize_views_backward,
     "recycled": lambda c: [[c.size("n"), c.size("m")]],
+    "release_memory": lambda c: [],
+    "recycled_twice": lambda c: [[c.size("n"), c.size("m")]],
     "ride": ride,
     "ride_backward": ride_backward,
     "ride_changes_backward": ride_changes_backward,

@@ -10,6 +10,10 @@ export interface Found {
   scores: [string, number][] | null;
   /** From the face to the camera, column by column, in centimetres; +y up, +z towards the viewer. */
   matrix: ArrayLike<number> | null;
+  /** Left, top, right and bottom of the nearest face, as parts of the picture; null without a face. */
+  box?: number[] | null;
+  /** Number of faces that were found, up to the number that was asked for. */
+  faces?: number;
   /** When the picture came, on the page's clock. */
   milliseconds: number;
   /** How long the detector worked on it. */

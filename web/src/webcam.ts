@@ -1,33 +1,27 @@
 // A webcam as a driver: MediaPipe's face landmarker in a worker, relative to one's own neutral face, smoothed.
 
+import { Detector, WebcamError, type DetectorParts } from "./detector";
 import { Follower, type Found, type Reading } from "./follower";
 import { transfer } from "./transfer";
 import type { Viewer } from "./viewer";
 
-/** The worker's script (build.mjs). */
-declare const DETECTOR: string;
-
+export { WebcamError } from "./detector";
+export type { DetectorParts } from "./detector";
 export { Follower } from "./follower";
 export type { Found, Reading } from "./follower";
 export { OneEuro } from "./one_euro";
 export type { Smoothing } from "./one_euro";
 
-/** Files of the npm package @mediapipe/tasks-vision, version 0.10.35, and the model: each by its address, or its content. */
-export interface DetectorParts {
-  /** vision_bundle.cjs. */
-  vision: string | ArrayBuffer;
-  /** wasm/vision_wasm_internal.js. */
-  loader: string | ArrayBuffer;
-  /** wasm/vision_wasm_internal.wasm. */
-  wasm: string | ArrayBuffer;
-  /** face_landmarker.task. */
-  model: string | ArrayBuffer;
-}
-
 export type WebcamState = "off" | "opening" | "calibrating" | "running" | "no face";
 
-/** What went wrong. Its message tells a person what to do. */
-export class WebcamError extends Error {}
+/** What a page says in each state. */
+export const WORDS: Record<WebcamState, string> = {
+  off: "",
+  opening: "Opening the camera. Allow it if the browser asks.",
+  calibrating: "Look straight ahead with a relaxed face for a second.",
+  running: "The avatar follows your face.",
+  "no face": "No face is seen. Look into the camera, in good light.",
+};
 
 /** Milliseconds without a face after which the state says so. */
 const LOST_AFTER = 1000;
@@ -41,20 +35,20 @@ export class Webcam {
   onState: (state: WebcamState, why?: string) => void = () => {};
 
   private current: WebcamState = "off";
-  private worker: Worker | null = null;
-  private opened: Promise<void> | null = null;
-  private busy = false;
   private run = 0;
-  private last = -1;
   private seen = 0;
   private send: () => void = () => {};
+  private readonly detector: Detector;
   private follower = new Follower();
   private readonly viewers = new Set<Viewer>();
   private readonly hide = () => document.hidden && this.stop("The camera is off, because the page was hidden.");
   private readonly leave = () => this.stop();
 
   /** `parts` is called at the first start, so that a page loads nothing large before. */
-  constructor(private readonly parts: () => DetectorParts | Promise<DetectorParts>) {
+  constructor(parts: () => DetectorParts | Promise<DetectorParts>) {
+    this.detector = new Detector(parts);
+    this.detector.onFound = (found) => this.current !== "off" && this.current !== "opening" && this.take(found);
+    this.detector.onError = (why) => this.stop(why);
     this.video.muted = this.video.playsInline = true;
   }
 
@@ -86,7 +80,7 @@ export class Webcam {
       stream.getVideoTracks()[0].addEventListener("ended", () => this.stop("The camera was taken away or switched off."));
       document.addEventListener("visibilitychange", this.hide);
       addEventListener("pagehide", this.leave);
-      await Promise.all([this.video.play(), (this.opened ??= this.open())]);
+      await Promise.all([this.video.play(), this.detector.open()]);
       if (run !== this.run) return;
     } catch (error) {
       if (run !== this.run) return; // stopped while it opened
@@ -131,48 +125,14 @@ export class Webcam {
     this.onState(state, why);
   }
 
-  /** Starts the worker. It stays for later starts. */
-  private async open(): Promise<void> {
-    try {
-      const parts: Record<string, ArrayBuffer> = {};
-      for (const [name, given] of Object.entries(await this.parts())) parts[name] = await bytes(given);
-      const address = URL.createObjectURL(new Blob([DETECTOR], { type: "text/javascript" }));
-      const worker = (this.worker = new Worker(address));
-      await new Promise<void>((done, fail) => {
-        worker.onerror = (event) => fail(new WebcamError(`The face detector does not start: ${event.message}`));
-        worker.onmessage = ({ data }) => (data.ready ? done() : fail(new WebcamError(`The face detector does not start: ${data.error}`)));
-        worker.postMessage({ parts }, Object.values(parts));
-      });
-      URL.revokeObjectURL(address);
-      worker.onerror = (event) => this.stop(`The face detector has failed: ${event.message}`);
-      worker.onmessage = ({ data }) => {
-        this.busy = false;
-        if (data.error) return this.stop(`The face detector has failed: ${data.error}`);
-        if (this.current !== "off" && this.current !== "opening") this.take(data);
-      };
-    } catch (error) {
-      this.worker?.terminate();
-      this.worker = this.opened = null;
-      throw error;
-    }
-  }
-
   /** Sends each new picture to the worker. Pictures that come while it works are left out. */
   private watch(run: number): void {
     const { video } = this;
     let newest = 0, sent = 0;
-    this.send = async () => {
-      if (this.run !== run || this.busy || newest <= sent) return;
-      this.busy = true;
-      // MediaPipe wants times that increase.
-      const milliseconds = (this.last = Math.max(newest, this.last + 1));
+    this.send = () => {
+      if (this.run !== run || this.detector.busy || newest <= sent) return;
       sent = newest;
-      try {
-        const picture = await createImageBitmap(video);
-        this.worker!.postMessage({ picture, milliseconds }, [picture]);
-      } catch {
-        this.busy = false; // the camera has just stopped
-      }
+      this.detector.see(() => createImageBitmap(video), newest);
     };
     // Firefox has the first since version 132. The second may send a picture twice.
     const wait = () => ("requestVideoFrameCallback" in video ? video.requestVideoFrameCallback(see) : requestAnimationFrame(see));
@@ -203,15 +163,8 @@ export class Webcam {
 
 const stop = (stream: MediaStream | null) => stream?.getTracks().forEach((track) => track.stop());
 
-async function bytes(given: string | ArrayBuffer): Promise<ArrayBuffer> {
-  if (typeof given !== "string") return given;
-  const answer = await fetch(given);
-  if (!answer.ok) throw new WebcamError(`${given} cannot be fetched: the server answers ${answer.status}.`);
-  return answer.arrayBuffer();
-}
-
 /** Opens the camera that faces the user, or says why not in words that help. */
-async function camera(): Promise<MediaStream> {
+export async function camera(video: MediaTrackConstraints = { width: { ideal: 640 }, height: { ideal: 480 } }): Promise<MediaStream> {
   if (!navigator.mediaDevices?.getUserMedia)
     throw new WebcamError(
       location.protocol === "file:"
@@ -221,7 +174,7 @@ async function camera(): Promise<MediaStream> {
           : "This browser gives no camera to this page. Open it with another browser.",
     );
   try {
-    return await navigator.mediaDevices.getUserMedia({ audio: false, video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 30 } } });
+    return await navigator.mediaDevices.getUserMedia({ audio: false, video: { facingMode: "user", frameRate: { ideal: 30 }, ...video } });
   } catch (error) {
     const { name, message } = error as DOMException;
     const words: Record<string, string> = {

@@ -2,12 +2,13 @@
 // Its own script, because detection would hold up the drawing of the page for several milliseconds.
 
 import type { Found } from "./follower";
-import type { DetectorParts } from "./webcam";
+import type { DetectorParts } from "./detector";
 
 interface Landmarker {
   detectForVideo(picture: ImageBitmap, milliseconds: number): {
     faceBlendshapes: { categories: { categoryName: string; score: number }[] }[];
     facialTransformationMatrixes: { data: number[] }[];
+    faceLandmarks: { x: number; y: number }[][];
   };
 }
 
@@ -21,7 +22,7 @@ const scope = self as unknown as {
 };
 let landmarker: Landmarker;
 
-async function open({ vision, loader, wasm, model }: Record<keyof DetectorParts, ArrayBuffer>): Promise<void> {
+async function open({ vision, loader, wasm, model }: Record<keyof DetectorParts, ArrayBuffer>, numFaces: number): Promise<void> {
   const address = (script: ArrayBuffer) => URL.createObjectURL(new Blob([script], { type: "text/javascript" }));
   // A page from a file has no origin of its own, and then a worker can import no modules, so this is CommonJS.
   scope.exports = {} as typeof scope.exports;
@@ -32,7 +33,7 @@ async function open({ vision, loader, wasm, model }: Record<keyof DetectorParts,
     { wasmLoaderPath: address(loader), wasmBinaryPath: "" },
     {
       baseOptions: { modelAssetBuffer: new Uint8Array(model), delegate: "CPU" },
-      runningMode: "VIDEO", numFaces: 1, outputFaceBlendshapes: true, outputFacialTransformationMatrixes: true,
+      runningMode: "VIDEO", numFaces, outputFaceBlendshapes: true, outputFacialTransformationMatrixes: true,
     },
   );
 }
@@ -43,15 +44,26 @@ for (const way of ["log", "info", "warn", "error"] as const) console[way] = () =
 scope.onmessage = async ({ data }) => {
   try {
     if (data.parts) {
-      await open(data.parts);
+      await open(data.parts, data.faces);
       return scope.postMessage({ ready: true });
     }
     const picture: ImageBitmap = data.picture, began = performance.now();
-    const { faceBlendshapes: [shapes], facialTransformationMatrixes: [matrix] } = landmarker.detectForVideo(picture, data.milliseconds);
+    const { faceBlendshapes, facialTransformationMatrixes, faceLandmarks } = landmarker.detectForVideo(picture, data.milliseconds);
+    // The nearest face counts, whichever was found first.
+    const boxes = faceLandmarks.map(boxOf), size = ([x0, y0, x1, y1]: number[]) => (x1 - x0) * (y1 - y0);
+    const near = boxes.reduce((best, box, k) => (size(box) > size(boxes[best]) ? k : best), 0);
+    const shapes = faceBlendshapes[near], matrix = facialTransformationMatrixes[near];
     picture.close();
     const scores: [string, number][] | null = shapes ? shapes.categories.map(({ categoryName, score }) => [categoryName, score]) : null;
-    scope.postMessage({ scores, matrix: matrix?.data ?? null, milliseconds: data.milliseconds, work: performance.now() - began });
+    const where = { box: boxes[near] ?? null, faces: boxes.length };
+    scope.postMessage({ scores, matrix: matrix?.data ?? null, ...where, milliseconds: data.milliseconds, work: performance.now() - began });
   } catch (error) {
     scope.postMessage({ error: `${(error as Error).message ?? error}` });
   }
 };
+
+/** Left, top, right and bottom of a face, as parts of the picture. */
+function boxOf(points: { x: number; y: number }[]): number[] {
+  const [xs, ys] = [points.map(({ x }) => x), points.map(({ y }) => y)];
+  return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+}

@@ -1,7 +1,7 @@
 // What `mien export --webcam` adds to the page: the button, and the detector's files, which are unpacked when it is pressed.
 
 import type { Viewer } from "./viewer";
-import { Webcam, WebcamError, type DetectorParts, type WebcamState } from "./webcam";
+import { Webcam, WebcamError, WORDS, type DetectorParts } from "./webcam";
 
 const find = <T extends HTMLElement>(id: string) => document.getElementById(id) as T;
 
@@ -15,14 +15,6 @@ async function unpacked(name: string): Promise<ArrayBuffer> {
 async function parts(): Promise<DetectorParts> {
   return { vision: await unpacked("vision"), loader: await unpacked("loader"), wasm: await unpacked("wasm"), model: await unpacked("model") };
 }
-
-const WORDS: Record<WebcamState, string> = {
-  off: "",
-  opening: "Opening the camera. Allow it if the browser asks.",
-  calibrating: "Look straight ahead with a relaxed face for a second.",
-  running: "The avatar follows your face.",
-  "no face": "No face is seen. Look into the camera, in good light.",
-};
 
 function addCamera(viewer: Viewer): Webcam {
   const { content } = find<HTMLTemplateElement>("camera-template"), [first, card, notices] = content.children;

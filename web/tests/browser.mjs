@@ -3,8 +3,10 @@
 // prints json: results of the scripts, requests of the page, its messages, and the ratio of the canvas at each saving.
 // server.mjs does the same for many pages in one browser. What can be asked for:
 //   "scripts": [..], "screenshots": [path or null, ..], "whole": true for screenshots of the whole page and not of the window
-//   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"drag": [x, y]},
-//     {"fill": [label, text]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
+//   "steps": [..] instead of scripts, each one of {"see": text}, {"click": text of a button}, {"press": selector},
+//     {"keys": names}, {"tab": selector}: Tab until that has the focus, {"back": selector}: the same by Shift+Tab; the focus
+//     has to be seen at each place, {"focused": selector}: wait until the page gives it the focus, {"drag": [x, y]},
+//     {"fill": [label, text]}, {"give": [selector of an input, path]}, {"save": [button, path]}, {"reload": true}, {"wait": milliseconds}, {"screenshot": path},
 //     {"settled": path}: a screenshot that differs from the last one and stays as it is
 //   "webgpu": true for WebGPU in software, "flags": further options of Chromium, "downloads": folder, "opening": a script
 //   that runs before those of the page, "lively": true for a page that may move by itself, "dark", "touch", "mobile",
@@ -60,14 +62,40 @@ export async function visit(browser, page, { width, height, scripts = [], screen
   }
 }
 
+/** Presses a key until a place has the focus. Each place on the way has to show that it has it; a frame shows it inside. */
+async function walk(tab, key, selector) {
+  const places = [];
+  for (let k = 0; k < 60; ++k) {
+    await tab.keyboard.press(key);
+    const [there, seen, place] = await tab.evaluate((wanted) => {
+      const element = document.activeElement, { outlineStyle, outlineWidth } = getComputedStyle(element), { width } = element.getBoundingClientRect();
+      const marked = width > 0 && outlineStyle !== "none" && parseFloat(outlineWidth) > 1;
+      return [element.matches(wanted), marked || ["BODY", "IFRAME"].includes(element.tagName), element.outerHTML.slice(0, 80)];
+    }, selector);
+    if (!seen) throw new Error(`the focus is not seen on ${place}`);
+    if (there) return;
+    places.push(place);
+  }
+  throw new Error(`${key} does not reach ${selector}, but ${places.join(", ")}`);
+}
+
 /** What steps do, by their names. */
 function actions(tab, width, height, shapes) {
   let last = Buffer.alloc(0);
   return {
     wait: (milliseconds) => tab.waitForTimeout(milliseconds),
     see: (text) => tab.getByText(text).first().waitFor(),
+    match: (pattern) => tab.getByText(new RegExp(pattern)).first().waitFor(),
     click: (text) => tab.getByText(text, { exact: true }).first().click(),
+    press: (selector) => tab.locator(selector).click(),
+    async keys(names) {
+      for (const name of names) await tab.keyboard.press(name);
+    },
+    tab: (selector) => walk(tab, "Tab", selector),
+    back: (selector) => walk(tab, "Shift+Tab", selector),
+    focused: (selector) => tab.locator(`${selector}:focus`).waitFor(),
     fill: ([label, text]) => tab.locator(`xpath=//*[text()="${label}"]/following::input[1]`).fill(text),
+    give: ([selector, path]) => tab.locator(selector).setInputFiles(path),
     screenshot: (path) => tab.screenshot({ path }),
     reload: () => tab.reload(),
     async settled(path) {

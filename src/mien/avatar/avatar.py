@@ -5,7 +5,7 @@ a method"). Methods that stay keep their settings in a file of their own, which 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -108,12 +108,17 @@ class Extras:
     """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
     frames_per_step: Callable[[], int] = lambda: 1
     """Returns the number of training frames that the next optimiser step uses."""
+    apart: bool = False
+    """Whether the frames of a step share nothing but the trained tensors, so that each may have a thread of its own."""
     pretraining: Pretraining | None = None
     """Training before the first picture. None if the avatar needs none."""
     closing: int = 0
     """Pixels by which finished pictures are eroded and then dilated (`close_holes`)."""
     unbaked: str | None = None
     """Why `bake` refuses the avatar, with its name. None for all that have a record, which is nearly all."""
+    graph_key: Callable[[Progress], Hashable] | None = None
+    """Returns the numbers from the host in a pose, if a CUDA graph of it does the same (`mien.training.graphs`): the
+    pose has no side effects, as a factored gradient is one, and gives Gaussians alone."""
 
 
 class Avatar(nn.Module, ABC):

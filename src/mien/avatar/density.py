@@ -29,7 +29,8 @@ def split_along_axes(
     offsets = (rotations @ (log_scales.exp() * noise)[..., None])[..., 0]
     return {
         "means": store["means"].detach()[parents] + offsets,
-        "log_scales": log_scales - torch.log(noise.new_tensor(1.6)),
+        # The logarithm in the dtype of the scales, on the CPU.
+        "log_scales": log_scales - float(torch.log(torch.tensor(1.6, dtype=log_scales.dtype))),
     }
 
 

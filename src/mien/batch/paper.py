@@ -137,10 +137,11 @@ def _state(line: Line, own: Sequence[dict[str, Any]], paper: Paper) -> str:
     return state + (f"; with {paper.typed}" if paper.typed else "")
 
 
-def write_table(batch: Batch, rows: Sequence[dict[str, Any]], paper: Paper | None) -> None:
-    """Write table.md and table.tex of the results, by a paper's table or else by methods."""
+def write_table(batch: Batch, rows: Sequence[dict[str, Any]], paper: Paper | None) -> list[list[str]]:
+    """Write table.md and table.tex of the results, by a paper's table or else by methods. Returns the table."""
     table, about = table_of(rows, paper or plain_table(rows)), ""
     if paper is not None:
         about = f"# {paper.title}\n\n{paper.source}. Our figures are means over subjects, with their deviation.\n\n"
     for name, text in (("table.md", about + markdown_table(table)), ("table.tex", latex_table(table))):
         write_atomically(batch.root / name, lambda aside, text=text: aside.write_text(text, encoding="utf-8"))
+    return table

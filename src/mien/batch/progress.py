@@ -4,6 +4,8 @@ import re
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from mien.batch.plan import Batch, Row, State
@@ -65,19 +67,37 @@ def _row(batch: Batch, row: Row, state: State | None) -> dict[str, Any]:
     return found
 
 
-def _stage(batch: Batch, state: State) -> dict[str, Any]:
-    """The stage that a running row is in, and the percentage of its present part, from its log."""
-    stage, percent, text = None, None, ""
+@dataclass(frozen=True)
+class Stage:
+    """The stage that a command is in."""
+
+    name: str
+    """Empty if the command has not said so."""
+    number: int
+    of: int
+    percent: int | None
+    """How far its present part is; None if that is not known."""
+
+
+def stage_of(log: Path, since: int = 0) -> Stage:
+    """The stage that the command which writes a log is in, by what follows its first `since` bytes."""
+    found, percent, text = ("", 0, 0), None, ""
     for most in (1 << 13, 1 << 17, 1 << 22):  # hours of lines may follow that of a stage
         if not _STAGE.search(text):
-            text = tail(batch.log_file(state.name), most=most)
+            text = tail(log, since, most)
     for line in text.replace("\r", "\n").splitlines():
         if named := _STAGE.search(line):
-            words = f"{named[3]} ({named[1]} of {named[2]})"
-            stage, percent = words, percent if words == stage else None
+            now = (named[3], int(named[1]), int(named[2]))
+            found, percent = now, percent if now == found else None
         elif part := _PART.search(line):
             percent = round(100 * int(part[1]) / max(int(part[2]), 1))
-    return {"stage": stage, "percent": percent}
+    return Stage(*found, percent)
+
+
+def _stage(batch: Batch, state: State) -> dict[str, Any]:
+    found = stage_of(batch.log_file(state.name))
+    words = f"{found.name} ({found.number} of {found.of})" if found.name else None
+    return {"stage": words, "percent": found.percent}
 
 
 def progress_text(found: dict[str, Any]) -> str:

@@ -132,12 +132,17 @@ def _latex(cell: str) -> str:
     return "".join(special.get(letter, letter) for letter in cell)
 
 
-def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
-    """Write index.html: thumbnails that turn, worst first, with a link to each report, and methods compared."""
+def write_wall(
+    batch: Batch, rows: Sequence[dict[str, Any]], table: Sequence[Sequence[str]] = (), about: Sequence[str] = ()
+) -> None:
+    """Write index.html: thumbnails that turn, worst first, with a link to each report, and methods compared.
+
+    A paper's `table`, `about` which are its title and its source, takes the place of the comparison.
+    """
     shown = [_card(batch, row) for row in rows if row.get("run")]
     shown.sort(key=lambda card: card["figures"].get("psnr", float("-inf")))
     failed = [row for row in rows if not row.get("run") and row["status"] == "failed"]
-    compared = paired(rows)
+    compared = [] if table else paired(rows)
     text = render(
         "batch/templates/wall.html",
         heading=batch.root.resolve().name,
@@ -149,6 +154,8 @@ def write_wall(batch: Batch, rows: Sequence[dict[str, Any]]) -> None:
         ],
         comparison=[_compared(entry) for entry in compared],
         several=any("minus" in entry for entry in compared),
+        table=table,
+        about=about,
     )
     write_atomically(batch.root / "index.html", lambda aside: aside.write_text(text, encoding="utf-8"))
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 
 from mien.capture.capture import Capture
 from mien.capture.frame_files import FRAMES, FrameLayout
@@ -28,7 +27,7 @@ from mien.capture.parts import Part, check_one_size, find_parts, number_parts, t
 from mien.capture.person.backend import Detector, detector_entry
 from mien.capture.person.faces import second_difference_jitter
 from mien.capture.person.given import GivenInputs, with_own_alpha
-from mien.capture.person.people import face_shapes, group_people, shape_difference
+from mien.capture.person.people import face_shapes, group_people, most_difference, shape_difference
 from mien.capture.person.survey import (
     Survey,
     check_upright,
@@ -159,16 +158,17 @@ def _kept(sequences: Path, job: CaptureJob, drafts: list[Draft]) -> list[Part]:
     people = group_people(shapes, [part.timesteps for part in parts]) if shapes else [[0]]
     tell_who(job.frames.path, parts, people, person)
     kept = people[person - 1]
-    first = drafts[max(kept, key=lambda index: parts[index].timesteps)]
-    check_neighbors(sequences, job.name, job.frames.path, first.pictures(), job.detector)
+    longest = drafts[max(kept, key=lambda index: parts[index].timesteps)]
+    check_neighbors(sequences, job.name, job.frames.path, longest, job.detector)
     return number_parts([parts[index] for index in kept], job.name)
 
 
-def check_neighbors(
-    sequences: Path, name: str, path: Path, pictures: UInt8[np.ndarray, "t h w 3"], detector: Detector
-) -> None:
-    """Check that other captures of a workspace show the person of the pictures of the new capture `name`."""
-    shapes = None
+def check_neighbors(sequences: Path, name: str, path: Path, draft: Draft, detector: Detector) -> None:
+    """Check that other captures of a workspace show the person of the new capture `name`.
+
+    Captures that are too short to be sure are taken, with a warning.
+    """
+    shapes, doubt = None, ""
     for json_path in sorted(sequences.glob(f"*/capture/{JSON_NAME}"))[:_NEIGHBORS]:
         folder = json_path.parent.parent
         try:
@@ -177,17 +177,23 @@ def check_neighbors(
             continue  # whoever uses it says what is wrong with it
         if name in (folder.name, part_in(other.source).get("of")):
             continue
-        shapes = face_shapes(pictures, detector) if shapes is None else shapes
+        shapes = face_shapes(draft.pictures(), detector) if shapes is None else shapes
         difference = shape_difference(shapes, face_shapes(other.images[:, 0], detector))
         if difference is None:
             continue
         if difference <= 1:
             return
-        raise UserError(
-            f"{path}: shows another person than {folder}: the shapes of their faces differ {difference:.1f} times as "
-            "much as those of one person do at most; give another workspace with --out, or --capture.person 0 if it is "
-            "the same person"
+        differ = f"the shapes of their faces differ {difference:.1f} times as much as those of one person do at most"
+        if difference > most_difference(float(np.ptp(draft.part.survey.timestamps)), float(np.ptp(other.timestamps))):
+            raise UserError(
+                f"{path}: shows another person than {folder}: {differ}; give another workspace with --out, or "
+                "--capture.person 0 if it is the same person"
+            )
+        doubt = (
+            doubt or f"warning: {path}: may show another person than {folder}, but is too short to be sure: {differ}"
         )
+    if doubt:
+        say(doubt)
 
 
 def _part_key(job: CaptureJob, number: int, count: int) -> str:

@@ -124,8 +124,11 @@ class Run:
         chosen = shard_of(rows, self.shard) if self.shard else rows
         for some in filter(None, ([row for row in chosen if row.first], [row for row in chosen if not row.first])):
             drive(batch, some, options)
-        write_wall(batch, results := write_results(batch))
-        write_table(batch, results, paper)
+        table = write_table(batch, results := write_results(batch), paper)
+        if paper is None:
+            write_wall(batch, results)
+        else:
+            write_wall(batch, results, table, (paper.title, paper.source))
         progress = batch_progress(batch)
         for line in progress_text(progress).splitlines():
             say(line)

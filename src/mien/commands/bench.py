@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     StepMethod = str
     CaptureName = str
 else:
-    StepMethod, CaptureName = Literal[tuple(STEP_BENCHMARKS)], Literal[tuple(PEOPLE["references"])]
+    StepMethod, CaptureName = Literal[tuple(GPU_BENCHMARKS)], Literal[tuple(PEOPLE["references"])]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Render(_Timed):
 
 @dataclass(frozen=True)
 class Scaling(_Timed):
-    """Measure how drawing scales: 10,000 to 300,000 Gaussians, at the sizes that papers report and up to 2048x2048."""
+    """Measure how drawing and training scale, by Gaussians, size, pictures and threads, and which share does not."""
 
     plot: Path | None = None
     """File for a chart, .svg (default: no chart)."""
@@ -73,9 +73,11 @@ class Scaling(_Timed):
 
     def run(self) -> None:
         """Measure and print the rows, then draw the chart."""
-        from mien.lab.benchmarking.render import scaling_suite, write_scaling_chart
+        from mien.lab.benchmarking.scaling import scaling_suite, shares_that_do_not_scale, write_scaling_chart
 
         rows = show_rows(scaling_suite(self.seconds), self.as_json)
+        if not self.as_json:
+            show("\n".join(shares_that_do_not_scale(rows)))
         if self.plot is not None:
             write_scaling_chart(self.plot, rows)
 
@@ -85,8 +87,8 @@ class TrainStep(_Timed):
     """Measure a training step (no footage is needed), and posing together with drawing."""
 
     method: StepMethod = DEFAULT_METHOD
-    """Method to measure. All but the default are measured on the CPU at 512x512, with the sizes of their papers or of
-    the preset standard."""
+    """Method to measure. All but the default are measured at 512x512, with the sizes of their papers or of the preset
+    standard; some on a GPU only."""
     parts: bool = False
     """Measure the parts of a step of the default method on the CPU, with all of its losses: 45,000 Gaussians, 512x512.
     A part is a phase of the step, or a function of the native core in it. Figures are means over the steps of the
@@ -99,8 +101,8 @@ class TrainStep(_Timed):
     def check(self) -> None:
         """Check that CUDA has gsplat, and that the options fit together."""
         check_device(self.device)
-        if self.method not in GPU_BENCHMARKS and self.device == "cuda":
-            raise UserError(f"--device cuda: {self.method} is measured on the CPU only; leave out --device")
+        if self.method not in STEP_BENCHMARKS and self.device != "cuda":
+            raise UserError(f"--method {self.method}: is measured on a GPU only; add --device cuda")
         if self.parts and self.method != DEFAULT_METHOD:
             raise UserError(f"--parts --method {self.method}: only {DEFAULT_METHOD} has parts; leave out one")
         if self.parts and self.device == "cuda":
@@ -114,7 +116,7 @@ class TrainStep(_Timed):
             show_rows(parts_suite(self.seconds), self.as_json, as_text=format_parts)
             return
         device = choose_device(self.device)
-        if device.type == "cuda" and self.method in GPU_BENCHMARKS:
+        if device.type == "cuda":
             show_rows(named(GPU_BENCHMARKS[self.method])(like_on(device), self.seconds), self.as_json, gpu=True)
         else:
             show_rows(named(STEP_BENCHMARKS[self.method])(self.seconds), self.as_json)

@@ -73,6 +73,8 @@ class Command:
     """Frames in overlay.mp4: all, every n-th, at most 120 (auto), or none."""
     view: bool = False
     """Show the avatar in a browser while it trains."""
+    growing: Path | None = None
+    """A .mien file to write the avatar to from time to time while it trains. `mien view FILE --follow` shows it."""
     options: Annotated[TrainOptions, tyro.conf.arg(name="")] = field(default_factory=TrainOptions.of)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: _Tracking = field(default_factory=_Tracking)
@@ -84,6 +86,10 @@ class Command:
         self.options.check()
         if self.view:
             check_viewer()
+        if self.growing is not None:
+            from mien.disk.files import check_writable  # imports numpy
+
+            check_writable(self.growing)
         if needs := SPLITS[split := self.options.settings().split].needs:
             raise UserError(
                 f"--split {split}: needs {needs}, and this command makes one sequence; use `mien capture` for each or "
@@ -105,6 +111,7 @@ class Command:
         from mien.pipeline.capture import run_capture_stage
         from mien.pipeline.create import name_next_commands, show_film, show_page
         from mien.pipeline.evaluate import run_evaluation_stage
+        from mien.pipeline.stage_times import FILE_NAME, StageTimes
         from mien.pipeline.track import run_tracking_stage, show_trackings
         from mien.pipeline.train import run_training_stage
         from mien.training.settings import check_held_out
@@ -113,7 +120,9 @@ class Command:
         method, settings = self.options.method_config(), self.options.settings()
         workspace, run = Workspace(self.out), run_name(self.run_name or self.options.method)
         self._check_files(workspace, run)
-        with stages("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out) as begin:
+        times = StageTimes(workspace.root / FILE_NAME)
+        named = ("capture", "tracking", "alignment", "training", *["scoring"] * settings.holds_out)
+        with stages(*named) as tell, times.one_by_one(tell) as begin:
             begin("capture")
             captured = run_capture_stage(workspace, self.videos, self.name, self.calibration, self.capture)
             check_held_out(captured, settings)
@@ -137,14 +146,14 @@ class Command:
             show_trackings(workspace, list(trackings), self.overlay)
             begin("training")
             published = PRESETS[self.options.preset].published
-            run_training_stage(workspace, names, run, method, settings, self.view, published)
+            run_training_stage(workspace, names, run, method, settings, self.view, published, self.growing)
             show_page(workspace, run)
             if settings.holds_out:
                 begin("scoring")
                 # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
                 run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
         show_film(workspace, run)
-        say(f"Done in {time.monotonic() - began:.0f} s.")
+        say(f"Done in {time.monotonic() - began:.0f} s. Stages: {times.told()}.")
         name_next_commands(workspace, run)
 
     def aligns(self, several_cameras: bool) -> bool:

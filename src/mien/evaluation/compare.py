@@ -122,6 +122,7 @@ def _shown(run: ScoredRun) -> list[str]:
     texts = [str(Comparison((run,), tuple(tables), ()).content()), *(table.ground for table in tables)]
     for entry in (table.rows[0].entry for table in tables):
         texts += [f"{value:.2f}" for value in (1e3 * entry["seconds_per_frame"], *entry["per_frame"]["head_psnr"])]
+        texts.append(", ".join(entry["per_frame"]["sequence"]))
     return [*texts, f"{training['gaussians']:,} {training['seconds']:.0f}"]
 
 

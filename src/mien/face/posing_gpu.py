@@ -1,7 +1,7 @@
-"""Posing of one timestep of a face in kernels for a GPU: four launches forward and four backward.
+"""Posing of a face in kernels for a GPU: four launches forward and four backward, for one timestep.
 
-One program moves the joints: its lanes are the joints, and one more, which is the head in the world. Products with the
-face model's bases and skinning weights are matrix products.
+A program moves the joints of a timestep: its lanes are the joints, and one more, which is the head in the world.
+Products with the face model's bases and skinning weights are matrix products.
 """
 
 from typing import TYPE_CHECKING, Any, no_type_check
@@ -40,6 +40,22 @@ def pose_face(model: "FaceModel", face: FaceParams, in_world: bool) -> tuple[Ten
 def head_poses(rotation: Tensor, translation: Tensor) -> Tensor:
     """`mien.face.posing.head_poses`: one launch forward and one backward."""
     return _HeadPoses.apply(rotation, translation)  # pyright: ignore[reportReturnType]
+
+
+def move_bones(
+    model: "FaceModel", face: FaceParams, T_world_rest: Tensor, slots: Tensor, bones: int
+) -> tuple[Tensor, Tensor] | None:
+    """Expression and pose features [b, c], and transforms [b, bones, 3, 4] in the head frame.
+
+    `slots` says which of the bones a joint is, or -1. The last bone stands still in the world while the head moves from
+    `T_world_rest`. None if the person's shape has a gradient.
+    """
+    constants = _constants(model)
+    _, joints = constants.rest.of(model, face)
+    if joints.requires_grad:
+        return None
+    motion = (face.expression, face.joints, face.head_rotation, face.head_translation)
+    return _Bones.apply(constants, joints, T_world_rest, slots, bones, *motion)  # pyright: ignore[reportReturnType]
 
 
 class _HeadPoses(torch.autograd.Function):
@@ -86,22 +102,25 @@ def _constants(model: "FaceModel") -> _Constants:
 _known: "WeakKeyDictionary[FaceModel, _Constants]" = WeakKeyDictionary()
 
 
+def _sizes(k: int, e: int, *, in_world: bool, corrected: bool) -> dict[str, Any]:
+    """Constants of the kernels that move joints. `corrected`: whether there are pose features."""
+    lanes = {"JOINTS": triton.next_power_of_2(k + 1), "EXPRESSIONS": triton.next_power_of_2(max(e, 1))}
+    return {"IN_WORLD": in_world, "CORRECTED": corrected, **lanes}
+
+
 class _Pose(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, own: _Constants, in_world: bool, *given: Tensor) -> tuple[Tensor, Tensor]:
         rest, joint_rest, *motion = (tensor.contiguous() for tensor in given)
-        k, e, v = len(joint_rest), motion[0].shape[1], len(rest)
+        k, v, e, j = len(joint_rest), len(rest), motion[0].shape[1], motion[1].shape[1]
         local, transforms, factors = (
             rest.new_empty(k + 1, 12),
             rest.new_empty(k + 1, 12),
             rest.new_empty(len(own.basis)),
         )
         pose, vertices, shaped = rest.new_empty(1, 4, 4), rest.new_empty(1, v, 3), rest.new_empty(v, 3)
-        joints = (*motion, joint_rest, own.turns, own.shifts, own.parents, own.free, k, e)
-        sizes = {
-            "IN_WORLD": in_world, "CORRECTED": len(own.basis) > e,
-            "JOINTS": triton.next_power_of_2(k + 1), "EXPRESSIONS": triton.next_power_of_2(max(e, 1)),
-        }  # fmt: skip
+        joints = (*motion, joint_rest, own.turns, own.shifts, own.parents, own.free, k, e, j)
+        sizes = _sizes(k, e, in_world=in_world, corrected=len(own.basis) > e)
         launch(_move_joints, 1, *joints, local, transforms, factors, pose, **sizes)
         moved, blended = torch.mv(own.basis.T, factors), torch.mm(own.weights, transforms[:k])
         launch(_skin, blocks(v, _BLOCK), rest, moved, blended, shaped, vertices, v, BLOCK=_BLOCK)
@@ -125,6 +144,40 @@ class _Pose(torch.autograd.Function):
             by_factors, *scratch, *results, **ctx.sizes,
         )  # fmt: skip
         return None, None, None, None, *results
+
+
+class _Bones(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, own: _Constants, joint_rest: Tensor, rest_pose: Tensor, slots: Tensor, count: int, *given: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        joint_rest, rest_pose, *motion = (tensor.contiguous() for tensor in (joint_rest, rest_pose, *given))
+        (b, e), j, k, empty = motion[0].shape, motion[1].shape[1], len(joint_rest), joint_rest.new_empty
+        local, transforms, poses = empty(b, k + 1, 12), empty(b, k + 1, 12), empty(b, 4, 4)
+        coefficients, bones = empty(b, e + 9 * j), empty(b, count, 3, 4)
+        ctx.joints = (joint_rest, own.turns, own.shifts, own.parents, own.free, k, e, j)
+        ctx.sizes, lanes = _sizes(k, e, in_world=False, corrected=True), triton.next_power_of_2(k + 1)
+        launch(_move_joints, b, *motion, *ctx.joints, local, transforms, coefficients, poses, **ctx.sizes)
+        launch(_choose_bones, b, transforms, poses, rest_pose, slots, bones, k, count, JOINTS=lanes)
+        ctx.save_for_backward(*motion, local, transforms, poses, rest_pose, slots)
+        return coefficients, bones
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_coefficients: Tensor, by_bones: Tensor) -> tuple[Tensor | None, ...]:
+        *motion, local, transforms, poses, rest_pose, slots = ctx.saved_tensors
+        b, k, by_bones = len(poses), local.shape[1] - 1, by_bones.contiguous()
+        by_transforms, by_poses = local.new_empty(b, k, 12), torch.empty_like(poses)
+        given, results = (poses, rest_pose, slots), [torch.empty_like(tensor) for tensor in motion]
+        launch(
+            _choose_bones_backward, b, by_bones, *given, by_transforms, by_poses, k, by_bones.shape[1],
+            JOINTS=ctx.sizes["JOINTS"],
+        )  # fmt: skip
+        launch(
+            _move_joints_backward, b, *motion, *ctx.joints, local, transforms, by_transforms, by_poses,
+            by_coefficients.contiguous(), torch.empty_like(local), torch.empty_like(local), *results, **ctx.sizes,
+        )  # fmt: skip
+        return *[None] * 5, *results
 
 
 @no_type_check
@@ -298,9 +351,19 @@ def _homogeneous(local, index, middle, column):
 @no_type_check
 @triton.jit
 def _move_joints(
-    expression, joints, rotation, translation, joint_rest, turns, shifts, parents, free, k, e, local, transforms,
-    factors, pose, IN_WORLD: tl.constexpr, CORRECTED: tl.constexpr, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr,
+    expression, joints, rotation, translation, joint_rest, turns, shifts, parents, free, k, e, given_joints, local,
+    transforms, factors, pose, IN_WORLD: tl.constexpr, CORRECTED: tl.constexpr, JOINTS: tl.constexpr,
+    EXPRESSIONS: tl.constexpr,
 ):  # fmt: skip
+    timestep = tl.program_id(0)
+    expression, joints, rotation = (
+        expression + timestep * e,
+        joints + timestep * 3 * given_joints,
+        rotation + timestep * 3,
+    )
+    translation, pose = translation + timestep * 3, pose + timestep * 16
+    local, transforms = local + timestep * 12 * (k + 1), transforms + timestep * 12 * (k + 1)
+    factors += timestep * (e + 9 * given_joints if CORRECTED else e)
     joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
     there, place = joint <= k, tl.load(free + joint, mask=joint < k, other=-1)
     x = _turn(0, expression, joints, rotation, turns, free, k, e, JOINTS, EXPRESSIONS)
@@ -337,10 +400,19 @@ def _move_joints(
 @no_type_check
 @triton.jit
 def _move_joints_backward(
-    expression, joints, rotation, translation, joint_rest, turns, shifts, parents, free, k, e, local, transforms,
-    given, by_pose, by_factors, by_transforms, by_local, by_expression, by_joints, by_rotation, by_translation,
-    IN_WORLD: tl.constexpr, CORRECTED: tl.constexpr, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr,
+    expression, joints, rotation, translation, joint_rest, turns, shifts, parents, free, k, e, given_joints, local,
+    transforms, given, by_pose, by_factors, by_transforms, by_local, by_expression, by_joints, by_rotation,
+    by_translation, IN_WORLD: tl.constexpr, CORRECTED: tl.constexpr, JOINTS: tl.constexpr, EXPRESSIONS: tl.constexpr,
 ):  # fmt: skip
+    timestep = tl.program_id(0)
+    expression, by_expression = expression + timestep * e, by_expression + timestep * e
+    joints, by_joints = joints + timestep * 3 * given_joints, by_joints + timestep * 3 * given_joints
+    rotation, by_rotation = rotation + timestep * 3, by_rotation + timestep * 3
+    by_translation, by_pose, given = by_translation + timestep * 3, by_pose + timestep * 16, given + timestep * 12 * k
+    of_all = timestep * 12 * (k + 1)
+    local, transforms = local + of_all, transforms + of_all
+    by_local, by_transforms = by_local + of_all, by_transforms + of_all
+    by_factors += timestep * (e + 9 * given_joints if CORRECTED else e)
     joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
     four = tl.arange(0, 4)
     at, kept = 4 * four[:, None] + four[None, :], (four < 3)[:, None]
@@ -394,3 +466,51 @@ def _back_to_expression(
     joint, number = tl.arange(0, JOINTS), tl.arange(0, EXPRESSIONS)
     at, there = (number[:, None] * k + joint[None, :]) * 3 + axis, (number < e)[:, None] & chosen[None, :]
     return tl.sum(tl.where(chosen, gradient, 0.0)[None, :] * tl.load(basis + at, mask=there, other=0.0), 1)
+
+
+@no_type_check
+@triton.jit
+def _choose_bones(transforms, poses, rest_pose, slots, bones, k, count, JOINTS: tl.constexpr):
+    """Transforms of the bones, and of the one that stands still: from the rest's head frame to that of the timestep."""
+    transforms, poses = transforms + tl.program_id(0) * 12 * (k + 1), poses + tl.program_id(0) * 16
+    bones, joint = bones + tl.program_id(0) * 12 * count, tl.arange(0, JOINTS)
+    slot = tl.load(slots + joint, mask=joint < k, other=-1)
+    for i in tl.static_range(12):
+        own = tl.load(transforms + 12 * joint + i, mask=slot >= 0, other=0.0)
+        tl.store(bones + 12 * slot + i, own, mask=slot >= 0)
+    for i in tl.static_range(3):
+        for j in tl.static_range(4):
+            total = 0.0 * tl.load(poses)
+            for a in tl.static_range(3):
+                place = tl.load(rest_pose + 4 * a + j)
+                if j == 3:
+                    place -= tl.load(poses + 4 * a + 3)
+                total += tl.load(poses + 4 * a + i) * place
+            tl.store(bones + 12 * (count - 1) + 4 * i + j, total)
+
+
+@no_type_check
+@triton.jit
+def _choose_bones_backward(
+    by_bones, poses, rest_pose, slots, by_transforms, by_poses, k, count, JOINTS: tl.constexpr
+):  # fmt: skip
+    poses, by_poses = poses + tl.program_id(0) * 16, by_poses + tl.program_id(0) * 16
+    by_transforms, by_bones = by_transforms + tl.program_id(0) * 12 * k, by_bones + tl.program_id(0) * 12 * count
+    joint = tl.arange(0, JOINTS)
+    slot = tl.load(slots + joint, mask=joint < k, other=-1)
+    for i in tl.static_range(12):
+        own = tl.load(by_bones + 12 * slot + i, mask=slot >= 0, other=0.0)
+        tl.store(by_transforms + 12 * joint + i, own, mask=joint < k)
+    given = by_bones + 12 * (count - 1)
+    for a in tl.static_range(3):
+        by_place = 0.0 * tl.load(poses)
+        for i in tl.static_range(3):
+            total = 0.0 * tl.load(poses)
+            for j in tl.static_range(4):
+                place = tl.load(rest_pose + 4 * a + j)
+                if j == 3:
+                    place -= tl.load(poses + 4 * a + 3)
+                    by_place -= tl.load(poses + 4 * a + i) * tl.load(given + 4 * i + 3)
+                total += place * tl.load(given + 4 * i + j)
+            tl.store(by_poses + 4 * a + i, total)
+        tl.store(by_poses + 4 * a + 3, by_place)

@@ -4,6 +4,9 @@ The mesh has a morph target for each expression and a skin with the face model's
 file, and what is left out.
 """
 
+import math
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +23,13 @@ from mien.formats.shared.glb_file import INDICES, VERTICES, Glb, GlbWriter, read
 from mien.formats.shared.splats import unit_quats
 from mien.machine import exact
 from mien.runtime.baked import MeshBound, PortableAvatar, Rig
-from mien.runtime.file import from_arrays, to_arrays
+from mien.runtime.file import content_digest, from_arrays, to_arrays
 from mien.runtime.named import GAZE_NAMES, is_gaze, turned_eyes
 from mien.runtime.posing import SH_C0, Face, Gaussians, rig_points
 from mien.runtime.rotation import matrix_from_axis_angle
 
 EXTENSION, VERSION = "MIEN_gaussian_avatar", 1
+_NAMES = (EXTENSION, "EXT_gaussian_avatar")
 TEXTURE_SIZE = 1024
 """Side of the texture in texels."""
 _SPLATS = "KHR_gaussian_splatting"
@@ -299,35 +303,76 @@ def _avatar_extension(path: Path, writer: GlbWriter, avatar: PortableAvatar) -> 
 
 def read_glb_avatar(path: Path) -> PortableAvatar:
     """Read the avatar in a .glb file: equal to that of the .mien file, array by array."""
-    glb = read_glb(path)
-    extensions = glb.content.get("extensions")
-    found = extensions.get(EXTENSION) if isinstance(extensions, dict) else None
-    if not isinstance(found, dict):
-        raise UserError(f"{path}: has no avatar of mien ({EXTENSION}); {_REMEDY}")
-    if found.get("version") != VERSION:
-        raise UserError(
-            f"{path}: has version {found.get('version')!r:.80} of {EXTENSION}, expected {VERSION}; {_REMEDY}"
-        )
-    try:
-        # Several arrays must not share a view, as a small file would otherwise fill the memory.
-        views = [described["bufferView"] for described in found["tensors"].values() if "bufferView" in described]
-        if sum(glb.content["bufferViews"][view]["byteLength"] for view in views) > len(glb.buffer):
-            raise ValueError("its arrays are larger than its buffer")
-        arrays = {name: _tensor(glb, described) for name, described in found["tensors"].items()}
-        header = dict(found["avatar"])
-        if "format" not in header:
-            raise ValueError("its header has no format")
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
-        raise UserError(f"{path}: is damaged ({repr(error)[:100]}); {_REMEDY}") from None
+    header, arrays, faults = _read_arrays(path)
+    if faults:
+        raise UserError(f"{path}: is damaged ({faults[0]}); {_REMEDY}")
     return from_arrays(path, header, arrays)
 
 
+def glb_faults(path: Path) -> list[str]:
+    """The mistakes of the avatar in a .glb file, as docs/spec describes it: of its arrays, then of what they mean.
+
+    Where arrays are wrong, their meaning is not looked at. Of the meaning, the first mistake is told.
+    """
+    header, arrays, faults = _read_arrays(path)
+    if faults:
+        return faults
+    for read in (header, header | {"sha256": content_digest(header.get("content"), arrays)}):
+        try:
+            from_arrays(path, read, arrays)
+        except UserError as error:
+            faults.append(str(error).removeprefix(f"{path}: "))
+    return list(dict.fromkeys(faults))
+
+
+def _read_arrays(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[str]]:
+    """The header and the arrays of the avatar in a .glb file, and their mistakes."""
+    glb = read_glb(path)
+    extensions = glb.content.get("extensions")
+    named = [extensions[name] for name in _NAMES if name in extensions] if isinstance(extensions, dict) else []
+    if not named or not isinstance(named[0], dict):
+        raise UserError(f"{path}: has no avatar of mien ({EXTENSION}); {_REMEDY}")
+    found, arrays, faults = named[0], {}, []
+    tensors, header = found.get("tensors"), found.get("avatar")
+    if found.get("version") != VERSION:
+        faults.append(f"version is {found.get('version')!r:.80}; {VERSION} is expected")
+    if not isinstance(tensors, dict) or not isinstance(header, dict) or "format" not in header:
+        return {}, {}, [*faults, "tensors, avatar or its format is missing, or is no object"]
+    taken = set()  # several arrays must not share a view, as a small file would otherwise fill the memory
+    for name, described in tensors.items():
+        try:
+            view = described.get("bufferView")
+            if view is not None and view in taken:
+                raise ValueError(f"bufferView {view} belongs to another array")
+            taken.add(view)
+            arrays[name] = _tensor(glb, described)
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
+            faults.append(f"tensors.{name:.200}: {' '.join(str(error).split()):.200}")
+    uses = Counter(_named(header.get("content")))
+    faults += [f"avatar names the array {name:.200}, which tensors lacks" for name in uses if name not in tensors]
+    faults += [f"tensors.{name:.200}: avatar names it {uses[name]} times" for name in tensors if uses[name] != 1]
+    return header, arrays, faults
+
+
+def _named(node: Any) -> Iterator[str]:
+    """The names of arrays in a tree of json."""
+    if isinstance(node, dict) and isinstance(node.get("tensor"), str):
+        yield node["tensor"]
+    elif isinstance(node, dict | list):
+        for part in node.values() if isinstance(node, dict) else node:
+            yield from _named(part)
+
+
 def _tensor(glb: Glb, described: dict[str, Any]) -> np.ndarray:
-    shape, kind = described["shape"], _KINDS[described["dtype"]]
+    shape, kind = described.get("shape"), described.get("dtype")
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise ValueError(f"dtype is {kind!r:.80}; float32 or int32 is expected")
     if not isinstance(shape, list) or not all(type(size) is int and size >= 0 for size in shape):
-        raise ValueError("a tensor's shape is wrong")
+        raise ValueError(f"shape is {shape!r:.80}; a list of integers from 0 is expected")
     data = glb.bytes_of(described["bufferView"]) if "bufferView" in described else b""
-    return np.frombuffer(data, kind).reshape(shape).copy()
+    if len(data) != 4 * math.prod(shape):
+        raise ValueError(f"its shape {shape} needs {4 * math.prod(shape)} bytes, and its bufferView has {len(data)}")
+    return np.frombuffer(data, _KINDS[kind]).reshape(shape).copy()
 
 
 def write(path: Path, content: Content, options: GlbOptions) -> str:

@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import torch
 
+from mien import _native
 from mien.machine.threads import thread_count
 
 Item = TypeVar("Item")
@@ -51,4 +52,5 @@ def stream_in_threads(
 
 def _prepare() -> None:
     torch.set_num_threads(1)
+    _native.keep_loops_serial(True)  # The core's threads would only wait for a core.
     torch.set_grad_enabled(False)  # Each thread has its own mode.

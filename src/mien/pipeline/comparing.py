@@ -21,7 +21,8 @@ from mien.machine.devices import DeviceName
 from mien.machine.progress import say
 from mien.machine.terminal import show
 from mien.pipeline.evaluate import run_evaluation_stage
-from mien.pipeline.quality import StageTimes, draw_and_track, reference_settings, score_unseen_views
+from mien.pipeline.quality import draw_and_track, reference_settings, score_unseen_views
+from mien.pipeline.stage_times import FILE_NAME, StageTimes
 from mien.pipeline.train import fill_in_split, run_training_stage
 from mien.training.footage.frames import training_frames
 from mien.training.footage.sequence import Sequence, read_sequence
@@ -109,7 +110,7 @@ def of_workspace(workspace: Workspace, split: Split) -> Subject:
 
 def _of_reference(reference: ReferenceCapture, out: Path) -> Subject:
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
-    _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / "seconds.json"))
+    _, trackings = draw_and_track(reference, drawn, workspace, StageTimes(workspace.root / FILE_NAME))
     held = reference_settings(reference, _PRESET.settings)
     return Subject(reference.name, workspace, list(trackings), held, reference, drawn)
 

@@ -24,9 +24,9 @@ from mien.pipeline.picture_options import PictureOptions
 from mien.pipeline.view import open_viewed
 from mien.pipeline.view_motions import switch_of
 from mien.runtime.camera_paths import fitted
-from mien.viewer.access import Door
+from mien.viewer.access import Door, address_of, listen
 from mien.viewer.camera import CameraSwitch
-from mien.viewer.server import address_of, listen, serve
+from mien.viewer.server import serve
 from mien.viewer.session import Seen, Session
 
 FPS = 25

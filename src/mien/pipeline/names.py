@@ -153,6 +153,12 @@ def check_viewer() -> None:
         raise UserError("the viewer needs the package viser, which is missing; run `pip install 'mien[viewer]'`")
 
 
+def check_studio() -> None:
+    """Check that the packages of the studio's server are installed."""
+    if not all(map(importlib.util.find_spec, ("starlette", "uvicorn", "segno"))):
+        raise UserError("the studio's server needs packages that are missing; run `pip install 'mien[studio,create]'`")
+
+
 def check_driver(
     by: Path, sequence: str | None = None, fps: float | None = None, capture: CaptureSettings | None = None
 ) -> Kind:

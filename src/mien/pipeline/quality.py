@@ -2,9 +2,6 @@
 
 import json
 import shutil
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -18,7 +15,6 @@ from mien.disk.files import read_json, replace_folder, write_atomically, write_j
 from mien.disk.locks import WAIT, hold
 from mien.disk.reading import remove_tree
 from mien.disk.workspace import Workspace
-from mien.errors import UserError
 from mien.evaluation.experiment import Experiment, avatar_image, target_image
 from mien.evaluation.load import load_experiments
 from mien.evaluation.metrics import crop_to
@@ -50,6 +46,7 @@ from mien.media.picture_files import write_png
 from mien.pipeline.align import one_camera, run_alignment_stage
 from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.evaluate import run_evaluation_stage, run_sequences
+from mien.pipeline.stage_times import FILE_NAME, StageTimes
 from mien.pipeline.track import run_tracking_stage
 from mien.pipeline.train import run_training_stage
 from mien.tracking.files import write_tracking
@@ -97,7 +94,7 @@ def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: i
     Frames of one camera are aligned as `mien create` does.
     """
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
-    times = StageTimes(workspace.root / "seconds.json")
+    times = StageTimes(workspace.root / FILE_NAME)
     say(f"== {reference.name}: {reference.description}")
     key, trackings = draw_and_track(reference, drawn, workspace, times)
     names, run = list(trackings), f"{method}-{steps}"
@@ -126,14 +123,13 @@ def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: i
             run_training_stage(true, names, run, _PRESET.config(method), settings)
             by_truth = score_unseen_views(reference, drawn, true, run)
     gaussians = read_training_summary(workspace.run_dir(run))["gaussians"]
-    row = QualityRow(
-        reference.name, key, method, steps, gaussians, protocol_means(metrics), errors, times.seconds, unseen, by_truth
-    )
+    seconds, means = times.seconds(), protocol_means(metrics)
+    row = QualityRow(reference.name, key, method, steps, gaussians, means, errors, seconds, unseen, by_truth)
     return row, _strip(workspace, run)
 
 
 def draw_and_track(
-    reference: ReferenceCapture, drawn: Path, workspace: Workspace, times: "StageTimes"
+    reference: ReferenceCapture, drawn: Path, workspace: Workspace, times: StageTimes
 ) -> tuple[str, dict[str, Tracking]]:
     """Draw, capture and track a reference capture, and skip stages with current results.
 
@@ -244,26 +240,6 @@ def _copy_capture(source: Path, folder: Path) -> None:
         remove_tree(aside)
         shutil.copytree(source, aside)
         replace_folder(target, aside)
-
-
-class StageTimes:
-    """Seconds of each stage, kept between calls. A stage with nothing to do does not overwrite its earlier time."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            self.seconds: dict[str, float] = dict(read_json(path, _FORMAT, _VERSION)["seconds"])
-        except UserError:
-            self.seconds = {}
-
-    @contextmanager
-    def measured(self, stage: str) -> Iterator[None]:
-        """Measure the time inside the context."""
-        began = time.monotonic()
-        yield
-        spent = round(time.monotonic() - began, 1)
-        self.seconds[stage] = max(spent, self.seconds.get(stage, 0.0))
-        write_json(self._path, _FORMAT, _VERSION, {"seconds": self.seconds})
 
 
 @torch.no_grad()

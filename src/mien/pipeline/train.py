@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 
 from mien.avatar.settings import MethodConfig, steps_of_passes
 from mien.capture.store import read_capture
@@ -60,10 +61,12 @@ def run_training_stage(
     settings: TrainSettings,
     view: bool = False,
     published: bool = False,
+    growing: Path | None = None,
 ) -> None:
     """Train a run on some sequences of the workspace. An interrupted run continues; a finished run stays as it is.
 
-    With `view`, browsers can watch it. `published` says that the settings are those of a paper.
+    With `view`, browsers can watch it. `growing` is a .mien file that gets its state from time to time. `published`
+    says that the settings are those of a paper.
     """
     run_dir = workspace.run_dir(run)
     check_untouched(run_dir)
@@ -83,7 +86,8 @@ def run_training_stage(
     with ExitStack() as closing:
         if not is_finished(run_dir):
             say(f"{run}: looks for what the pictures show of the head, before the first step")
-        live = TrainingView(run, loaded[0].tracking.cameras[0]) if view else None
+        shown = view or growing is not None
+        live = TrainingView(run, loaded[0].tracking.cameras[0], growing, view) if shown else None
         if live is not None:
             closing.callback(live.close)
         train(loaded, face_model, method, settings, run_dir, watch=live)

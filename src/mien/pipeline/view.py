@@ -22,10 +22,10 @@ from mien.media.camera_names import devices
 from mien.runtime.baked import PortableAvatar
 from mien.runtime.file import read_portable
 from mien.runtime.still import follows_mesh
-from mien.viewer.access import Door, is_loopback
+from mien.viewer.access import Door, address_of, is_loopback, listen
 from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import Mesh
-from mien.viewer.server import address_of, listen, serve
+from mien.viewer.server import serve
 from mien.viewer.session import Session
 
 if TYPE_CHECKING:

@@ -26,10 +26,15 @@ _SHARE = 1 / 40
 class TrainingView:
     """Shows the avatar of a run in browsers, from its first steps to its end. Call it after each step."""
 
-    def __init__(self, name: str, camera: Camera) -> None:
-        """Prepare the viewer, which starts at the first call. The page has that name and that first view."""
-        self._name, self._camera = name, camera
+    def __init__(self, name: str, camera: Camera, growing: Path | None = None, viewer: bool = True) -> None:
+        """Prepare the viewer, which starts at the first call. The page has that name and that first view.
+
+        `growing` is the file that the avatar is written to, and that stays. Without it, the file is a temporary one.
+        Without `viewer`, the avatar is only written.
+        """
+        self._name, self._camera, self._has_viewer = name, camera, viewer
         self._folder = Path(tempfile.mkdtemp(prefix="mien-view-"))
+        self._file = growing or self._folder / "training.mien"
         self._due = 0.0
         self._viewer: subprocess.Popen[bytes] | None = None
 
@@ -38,15 +43,14 @@ class TrainingView:
         began = time.monotonic()
         if began < self._due:
             return
-        file = self._folder / "training.mien"
         try:
-            write_portable(file, make_portable(avatar, self._camera, self._name, to_share=False))
+            write_portable(self._file, make_portable(avatar, self._camera, self._name, to_share=False))
         except (UserError, OSError) as error:
-            say(f"--view: the avatar cannot be shown ({error}); training goes on without a viewer")
+            say(f"the growing avatar cannot be shown ({error}); training goes on without that")
             self._due = math.inf
             return
-        if self._viewer is None:
-            self._viewer = start_viewer(file)
+        if self._viewer is None and self._has_viewer:
+            self._viewer = start_viewer(self._file)
         now = time.monotonic()
         self._due = now + max(LEAST_SECONDS, (now - began) / _SHARE)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import left_to_autograd, recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, recycled_twice, unpacked
 from mien.camera import Camera
 from mien.gaussians import Gaussians, Rendering
 from mien.render.validation import TooManyPairsError, check_finite
@@ -67,12 +67,14 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, sizes: list[tuple[int, int]], *inputs: Tensor) -> tuple[Tensor, ...]:
-        outputs, tasks, kept = [], [], []
+        outputs, tasks, kept, pictures = [], [], [], []
         for index, size in enumerate(sizes):
             own = inputs[_INPUTS * index + 1 : _INPUTS * (index + 1)]
             kept += own[:5]
             count = len(own[0])
-            view = (recycled(*size, 3), recycled(*size), torch.empty(count, dtype=torch.int32))
+            (image, kept_image), (alpha, kept_alpha) = recycled_twice((*size, 3)), recycled_twice(size)
+            pictures += (kept_image, kept_alpha)
+            view = (image, alpha, torch.empty(count, dtype=torch.int32))
             known = unpacked(*own, *view)
             tasks.append(_native.RasterizeView(_native.GaussianArrays(*known[:5]), *known[5:]))
             outputs += view
@@ -86,9 +88,8 @@ class _Rasterize(torch.autograd.Function):
             raise _NotFiniteError(ctx.frames.index(None))
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*outputs[2::3])
-        # PyTorch would make a tensor of each that it saves. A picture would keep itself, but for its history.
-        ctx.offsets, ctx.kept = inputs[::_INPUTS], kept
-        ctx.pictures = [output.data for output in outputs if output.is_floating_point()]
+        # PyTorch would make a tensor of each that it saves.
+        ctx.offsets, ctx.kept, ctx.pictures = inputs[::_INPUTS], kept, pictures
         return tuple(outputs)
 
     @staticmethod

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Literal
 
 import torch
@@ -58,8 +59,7 @@ def rasterize(
     check_shapes(gaussians, background)
     batch = _views(gaussians, camera)
     shape = (len(gaussians), 2) if batch is None else (len(batch), len(gaussians), 2)
-    # An expanded zero needs no cleared memory, and its gradient is still a full tensor.
-    offset = gaussians.means.new_zeros(()).expand(shape).requires_grad_(torch.is_grad_enabled())
+    offset = _offset(shape, gaussians.means)
     if batch is None:
         assert isinstance(camera, Camera)
         view = _in_local_frame(gaussians, camera)
@@ -89,10 +89,18 @@ def rasterize_each(views: Sequence[View], backgrounds: Sequence[Float[Tensor, " 
         check_shapes(gaussians, background)
     like = views[0][0].means
     # One leaf for each view, so that each has its own gradient.
-    offsets = [
-        like.new_zeros(()).expand(len(gaussians), 2).requires_grad_(torch.is_grad_enabled()) for gaussians, _ in views
-    ]
+    offsets = [_offset((len(gaussians), 2), like) for gaussians, _ in views]
     return _render("auto", [_in_local_frame(*view) for view in views], backgrounds, offsets)
+
+
+def _offset(shape: tuple[int, ...], like: Tensor) -> Tensor:
+    # An expanded zero needs no cleared memory, and its gradient is still a full tensor.
+    return _zero(like.dtype, like.device).expand(shape).requires_grad_(torch.is_grad_enabled())
+
+
+@cache
+def _zero(dtype: torch.dtype, device: torch.device) -> Float[Tensor, ""]:
+    return torch.zeros((), dtype=dtype, device=device)
 
 
 def _depths(views: Sequence[View], pictures: Sequence[Rendering], backend: Backend) -> list[Tensor]:

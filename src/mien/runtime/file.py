@@ -58,7 +58,7 @@ def to_arrays(path: Path, avatar: PortableAvatar) -> tuple[dict[str, Any], dict[
     check(avatar, str(path))
     arrays: dict[str, np.ndarray] = {}
     content = _tree(avatar, "", arrays)
-    header = {"format": FORMAT, "version": VERSION, "sha256": _digest(content, arrays), "content": content}
+    header = {"format": FORMAT, "version": VERSION, "sha256": content_digest(content, arrays), "content": content}
     return header, arrays
 
 
@@ -73,7 +73,7 @@ def from_arrays(path: Path, header: Any, arrays: dict[str, np.ndarray]) -> Porta
                 f"{path}: has format {found[0]!r:.80} version {found[1]!r:.80}, expected {FORMAT!r} version {VERSION}; "
                 "export it again with `mien export`"
             )
-        if header["sha256"] != _digest(header["content"], arrays):
+        if header["sha256"] != content_digest(header["content"], arrays):
             raise UserError(
                 f"{path}: does not match its checksum, so it was damaged or changed; copy it again, or export it again "
                 "with `mien export`"
@@ -122,7 +122,8 @@ def _restored(node: Any, arrays: dict[str, np.ndarray]) -> Any:
     return [_restored(item, arrays) for item in node] if isinstance(node, list) else node
 
 
-def _digest(content: Any, arrays: dict[str, np.ndarray]) -> str:
+def content_digest(content: Any, arrays: dict[str, np.ndarray]) -> str:
+    """The checksum of a header's content and of the arrays that it names."""
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):
         digest.update(name.encode() + str(array.dtype).encode() + struct.pack(f"<{array.ndim}q", *array.shape))

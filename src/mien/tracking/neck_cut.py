@@ -99,9 +99,11 @@ def above_neck_cut(cut: NeckCut, camera: Camera) -> Float[np.ndarray, "h w"]:
     because the temporary arrays of a whole picture are many times as large as the picture.
     """
     bands = (range(row, min(row + _BAND, camera.height)) for row in range(0, camera.height, _BAND))
-    K, eye = (tensor.numpy().astype(float) for tensor in (camera.K, camera.position))
+    K, view = camera.K.numpy().astype(float), camera.viewmat.numpy()
+    x, y, z = view[:3, :3] * view[:3, 3:]
+    eye = -((x + y) + z).astype(float)
     start = ((eye - cut.origin) @ cut.axes.T).astype(np.float32)
-    turned = cut.axes @ (camera.viewmat.numpy()[:3, :3].astype(float).T @ np.linalg.inv(K))
+    turned = cut.axes @ (view[:3, :3].astype(float).T @ np.linalg.inv(K))
     rays = _Rays(start, turned, camera.width, np.float32(K[1, 1]))
     return np.concatenate([_above_in_rows(cut, rays, band) for band in bands])
 

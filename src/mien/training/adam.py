@@ -48,8 +48,12 @@ class Adam:
     def __init__(self) -> None:
         self._moments: dict[str, dict[str, Moments | FactoredMoments]] = {}
 
-    def step(self, groups: Iterable[ParameterGroup], progress: Progress) -> None:
-        """Update every tensor that has a gradient, at its group's rate, and clear the gradients."""
+    def step(self, groups: Iterable[ParameterGroup], progress: Progress, frames: int = 1) -> None:
+        """Update every tensor that has a gradient, at its group's rate, and clear the gradients.
+
+        Gradients that are means over several `frames` decay as if the frames had come one after the other: to the power
+        of their number (the rule of batches for Adam: Malladi et al., NeurIPS 2022; Grendel, ICLR 2025, has the same).
+        """
         updates: list[Update] = []
         for group in groups:
             rate = group.rate_at(progress)
@@ -70,7 +74,7 @@ class Adam:
                 if rate > 0:
                     state = self._state(group, name, tensor, Moments)
                     updates.append(Update(tensor, gradient, state, rate, group.epsilon))
-        update_all(updates)
+        update_all(updates, frames)
 
     def state(self) -> dict[str, Moments | FactoredMoments]:
         """The state of all tensors that have no store, by group and tensor."""
@@ -92,37 +96,38 @@ class Adam:
         return state
 
 
-def update_all(updates: Sequence[Update]) -> None:
+def update_all(updates: Sequence[Update], frames: int = 1) -> None:
     """Apply all updates in place: natively if tensors are float32, contiguous and on a CPU, with mien's `EPSILON`."""
     tasks, others = [], []
     for update in updates:
         values, gradient, moments, rate, epsilon = update
         arrays = (values, gradient, moments.first, moments.second, moments.step)
         if epsilon == EPSILON and _fit_core(arrays):
-            tasks.append((*unpacked(*arrays), rate))
+            tasks.append((*unpacked(*arrays), rate, frames))
         else:
             others.append(update)
     if tasks:
         _native.adam_update(tasks)
     if others:
-        update_reference(*others)
+        update_reference(*others, frames=frames)
 
 
 @torch.no_grad()
-def update_reference(*updates: Update) -> None:
+def update_reference(*updates: Update, frames: int = 1) -> None:
     """Updates in plain PyTorch. Each operation takes all tensors at once, which are few launches on a GPU."""
     values, gradients, states, rates, epsilons = map(list, zip(*updates, strict=True))
+    beta1, beta2 = BETA1**frames, BETA2**frames
     first, second = [moments.first for moments in states], [moments.second for moments in states]
     for moments in states:
         moments.step += 1
     steps = [float(moments.step) for moments in states]
-    torch._foreach_lerp_(first, gradients, 1 - BETA1)
-    torch._foreach_mul_(second, BETA2)
-    torch._foreach_addcmul_(second, gradients, gradients, 1 - BETA2)
+    torch._foreach_lerp_(first, gradients, 1 - beta1)
+    torch._foreach_mul_(second, beta2)
+    torch._foreach_addcmul_(second, gradients, gradients, 1 - beta2)
     denominators = torch._foreach_sqrt(second)
-    torch._foreach_mul_(denominators, [1 / math.sqrt(1 - BETA2**step) for step in steps])
+    torch._foreach_mul_(denominators, [1 / math.sqrt(1 - beta2**step) for step in steps])
     torch._foreach_add_(denominators, epsilons)
-    shares = [-rate / (1 - BETA1**step) for rate, step in zip(rates, steps, strict=True)]
+    shares = [-rate / (1 - beta1**step) for rate, step in zip(rates, steps, strict=True)]
     torch._foreach_addcdiv_(values, first, denominators, shares)
 
 

@@ -6,7 +6,7 @@ the template, which stays as it is, looks like the picture. This is tracking: a 
 face parameters, as in every fit to pixels, and reaches no avatar and no face of another frame.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
+from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
@@ -38,7 +39,7 @@ from mien.training.run import read_face_track
 from mien.training.settings import PRESETS, AlignmentSettings, TrainSettings
 from mien.training.trainer import ProgressBar, train
 
-ALIGNED_TOGETHER = 4  # number of timesteps that are aligned in one pass
+ALIGNED_BETWEEN = 16  # number of timesteps from one time that results are written to the next
 _ALIGNED_JUDGED = 32  # number of training timesteps that say how large gradients are
 _ALIGNED_MOMENTUM = 0.7  # share of the last steps' direction in the next one. Measured: the log, 11-27
 _ALIGNED_EXPRESSION = 10.0
@@ -62,9 +63,8 @@ _Timestep = tuple[int, int, tuple[int, ...]]
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One picture, and which timestep of its batch it belongs to."""
+    """One picture of a timestep."""
 
-    place: int
     camera: Camera
     target: Target
     gain: Float[Tensor, " 3"] | None
@@ -163,20 +163,24 @@ def align_faces(
     trained = {frame[:2] for frame in known}
     judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, _ALIGNED_JUDGED)
     with one_torch_thread(), frozen(avatar):
-        sizes = _sizes([_Batch.of(part, track, targets, gains) for part in _batches(judged)], avatar, track)
+        sizes = _sizes((_Target.of(one, track, targets, gains) for one in judged), avatar, track)
         indices = [track.index_of(*timestep[:2]) for timestep in timesteps]
         done = _take_up(folder, track, indices)
+
+        @torch.enable_grad()
+        def descended(target: _Target) -> None:
+            for _ in range(settings.iterations):
+                target.find_gradients(avatar, track)
+                descend(track.parameter_groups(target.index), sizes)
+                track.confine(target.index)
+
         with progress("aligning frames", len(timesteps), done) as advance:
-            for part in _batches(timesteps[done:]):
-                batch = _Batch.of(part, track, targets, gains)
-                for _ in range(settings.iterations):
-                    batch.find_gradients(avatar, track)
-                    descend(batch.groups(track), sizes)
-                    for index in batch.indices:
-                        track.confine(index)
-                done += len(part)
-                _keep(folder, track, indices[:done])
-                advance(len(part))
+            waiting = (_Target.of(one, track, targets, gains) for one in timesteps[done:])
+            for _ in stream_in_threads(descended, waiting):
+                done += 1
+                if done % ALIGNED_BETWEEN == 0 or done == len(timesteps):
+                    _keep(folder, track, indices[:done])
+                advance(1)
     track.steady_pose()
     return _split(track.params().detach(), lengths)
 
@@ -221,39 +225,28 @@ def _tuning(single: bool) -> FaceTuning:
     return FaceTuning(True, *own, keep_mean_pose=True, keep_turns=single, within_bounds=True)
 
 
-def _batches(timesteps: list[_Timestep]) -> Iterator[list[_Timestep]]:
-    for first in range(0, len(timesteps), ALIGNED_TOGETHER):
-        yield timesteps[first : first + ALIGNED_TOGETHER]
-
-
 @dataclass(frozen=True, eq=False)
-class _Batch:
-    """Timesteps that are drawn together, for speed alone, with their pictures."""
+class _Target:
+    """What one timestep is to look like."""
 
-    indices: list[int]
-    """Indices of the timesteps in the track."""
+    index: int
+    """Index of the timestep in the track."""
     views: list[_View]
 
     @staticmethod
-    def of(timesteps: list[_Timestep], track: FaceTrack, targets: Items[Targets], gains: Items[Tensor]) -> "_Batch":
-        """The batch of some timesteps."""
-        views = []
-        for place, (sequence, timestep, cameras) in enumerate(timesteps):
-            own, gain = targets[sequence], gains[sequence][timestep] if gains else None
-            for camera in cameras:
-                target = own.target(timestep, camera, _WHITE, keep=False)
-                views.append(_View(place, own.camera(camera), target, gain))
-        return _Batch([track.index_of(sequence, timestep) for sequence, timestep, _ in timesteps], views)
-
-    def groups(self, track: FaceTrack) -> list[ParameterGroup]:
-        """The parameters of all timesteps."""
-        return [group for index in self.indices for group in track.parameter_groups(index)]
+    def of(timestep: _Timestep, track: FaceTrack, targets: Items[Targets], gains: Items[Tensor]) -> "_Target":
+        """The target of a timestep. Only one thread may make targets."""
+        sequence, number, cameras = timestep
+        own, gain = targets[sequence], gains[sequence][number] if gains else None
+        pictures = {camera: own.target(number, camera, _WHITE, keep=False) for camera in cameras}
+        views = [_View(own.camera(camera), target, gain) for camera, target in pictures.items()]
+        return _Target(track.index_of(sequence, number), views)
 
     def find_gradients(self, avatar: Avatar, track: FaceTrack) -> None:
         """Draw all views, and leave the gradient of what differs from their pictures at the parameters."""
-        posed = avatar.pose(concatenate([track.face(index) for index in self.indices])).gaussians.timesteps()
+        posed = avatar.pose(track.face(self.index)).gaussians.timestep(0)
         pictures = rasterize_each(
-            [(posed[view.place], view.camera) for view in self.views], [view.target.background for view in self.views]
+            [(posed, view.camera) for view in self.views], [view.target.background for view in self.views]
         )
         losses = []
         for picture, view in zip(pictures, self.views, strict=True):
@@ -281,13 +274,18 @@ def descend(groups: Items[ParameterGroup], sizes: Mapping[str, float]) -> None:
             tensor -= group.rate.start / max(sizes[group.name], _EPSILON) * unbiased
 
 
-def _sizes(batches: list[_Batch], avatar: Avatar, track: FaceTrack) -> dict[str, float]:
-    """The sizes for `descend` at the present parameters of some batches."""
+def _sizes(targets: Iterable[_Target], avatar: Avatar, track: FaceTrack) -> dict[str, float]:
+    """The sizes for `descend` at the present parameters of some timesteps."""
+
+    @torch.enable_grad()
+    def gradients(target: _Target) -> dict[str, list[Tensor]]:
+        target.find_gradients(avatar, track)
+        return {group.name: _taken(group) for group in track.parameter_groups(target.index)}
+
     found: dict[str, list[Tensor]] = {}
-    for batch in batches:
-        batch.find_gradients(avatar, track)
-        for group in batch.groups(track):
-            found.setdefault(group.name, []).extend(_taken(group))
+    for own in stream_in_threads(gradients, targets):
+        for name, each in own.items():
+            found.setdefault(name, []).extend(each)
     return {name: torch.stack(own).double().square().mean().sqrt().item() for name, own in found.items()}
 
 

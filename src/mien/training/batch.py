@@ -119,6 +119,8 @@ class TrainingData:
     coarse_steps: int = 0
     ahead: TargetQueue | None = None
     """Prepares the targets of the next steps in another thread. If it is None, each step makes its own."""
+    each: Callable[[Items[Callable[[], Any]]], list[Any]] = lambda calls: [call() for call in calls]
+    """Calls functions, on threads of their own if there are some, and returns their results in order."""
 
     def targets_at(self, step: int) -> tuple[Targets, ...]:
         """The targets of a step, one entry per sequence."""
@@ -174,7 +176,7 @@ def draw(
 ) -> tuple[Posed, list[Posed], list[Rendering]]:
     """The Gaussians of all frames, posed together; the same frame by frame, as they are drawn; and their pictures."""
     faces = [one.face for one in batch]
-    posed = state.avatar.pose(faces[0] if len(faces) == 1 else concatenate(faces), progress)
+    posed = state.graph.pose(state.avatar, faces[0] if len(faces) == 1 else concatenate(faces), progress)
     each = [posed] if len(batch) == 1 else [replace(posed, gaussians=own) for own in posed.gaussians.timesteps()]
     if state.head is not None:
         each = [state.head.posed(own, one) for one, own in zip(batch, each, strict=True)]
@@ -194,18 +196,20 @@ def seen(state: TrainingState, batch: Items[BatchFrame], renderings: Items[Rende
     return shown
 
 
-def compare(state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]) -> dict[str, Float[Tensor, ""]]:
-    """The losses that compare pictures, by name: means over the frames."""
+def compare(
+    state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering], count: int = 0
+) -> dict[str, Float[Tensor, ""]]:
+    """The losses that compare pictures, by name: means over the frames, or sums over them divided by `count`."""
     own = state.avatar.config.photometric
-    weights = (own if state.head is None else state.head.weights(own)).scaled(1 / len(batch))
+    weights = (own if state.head is None else state.head.weights(own)).scaled(1 / (count or len(batch)))
     return _summed(picture_losses(image, one.target, weights) for one, image in zip(batch, shown, strict=True))
 
 
 def compare_features(
-    state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering]
+    state: TrainingState, batch: Items[BatchFrame], shown: Items[Rendering], count: int = 0
 ) -> dict[str, Float[Tensor, ""]]:
-    """The perceptual loss, if it is due in one of the frames: the mean over all frames."""
-    settings = state.avatar.config.photometric.perceptual.scaled(1 / len(batch))
+    """The perceptual loss, if it is due in one of the frames: as `compare`."""
+    settings = state.avatar.config.photometric.perceptual.scaled(1 / (count or len(batch)))
     return _summed(
         {"perceptual": perceptual_loss(image, one.goal(), settings)}
         for one, image in zip(batch, shown, strict=True)

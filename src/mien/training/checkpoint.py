@@ -1,6 +1,6 @@
 """Checkpoints: everything that the rest of a run depends on. Each is one file, written atomically."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import torch
@@ -20,6 +20,7 @@ from mien.training.adam import Adam
 from mien.training.colors import CameraColors, FrameGains, LearnedColors
 from mien.training.density_control.strategy import DensityStrategy
 from mien.training.footage.face_track import FaceTrack
+from mien.training.graphs import PoseGraph
 from mien.training.whole_head.head import WholeHead
 
 _KEPT_CHECKPOINTS = 2
@@ -49,6 +50,8 @@ class TrainingState:
     """Most memory of the host that one of these processes has taken, in MB, when it was last measured."""
     gpu_memory_mb: float = 0.0
     """The same for the tensors on the GPU; 0 for a run on the CPU."""
+    graph: PoseGraph = field(default_factory=PoseGraph)
+    """Poses the avatar. No checkpoint has it."""
 
     @property
     def colors(self) -> list[FrameGains | CameraColors]:

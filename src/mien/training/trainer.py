@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien import _native
 from mien.arrays import direct_gradients, own_derivative
-from mien.avatar.avatar import Avatar, Posed, move_avatar
+from mien.avatar.avatar import Avatar, ParameterGroup, Posed, move_avatar
 from mien.avatar.baking import measure_filmed
 from mien.avatar.density import DensityControl, GradientDensity
 from mien.avatar.files import load_avatar
@@ -34,6 +35,7 @@ from mien.machine.threads import one_torch_thread
 from mien.perceptual.features import load_training_features
 from mien.render.validation import CannotDrawError
 from mien.training.adam import Adam
+from mien.training.apart import frames_apart, summed, threads_of_frames
 from mien.training.batch import (
     TrainingData,
     coarse_steps,
@@ -153,8 +155,9 @@ def _train_to_the_end(
         one_torch_thread(),
         stops_put_off() as stop,
         targets_ahead(data.order, data.targets_at, settings) as ahead,
+        threads_of_frames(state.avatar.face_model.template) as each,
     ):
-        data = replace(data, ahead=ahead)
+        data = replace(data, ahead=ahead, each=each)
         pretrain(state, settings, progress, stop.follow)
         with progress("training", settings.steps, state.step) as advance:
             while state.step < settings.steps:
@@ -309,18 +312,28 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     progress = Progress(state.step, settings.steps, data.order.at(state.step)[1], data.extent, len(batch))
     if head is not None:
         head.before_step(batch, data.meanwhile)
-    whole, posed, renderings = draw(state, batch, progress)
-    shown = seen(state, batch, renderings)
-    losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
-    losses |= compare_features(state, batch, shown)
-    if head is not None:
-        losses |= head.losses(progress)
-    with direct_gradients():
-        torch.autograd.backward(list(losses.values()), [own_derivative(loss) for loss in losses.values()])
+    groups = _groups(state, batch)
+    parts, losses = [], {}
+    if avatar.extras.apart and len(batch) > 1:
+        parts = frames_apart(state, batch, progress, groups, data.each)
+        posed = [part.posed for part in parts if part.posed is not None]
+        renderings = [part.rendering for part in parts if part.rendering is not None]
+        shown = [part.shown for part in parts if part.shown is not None]
+    else:
+        whole, posed, renderings = draw(state, batch, progress)
+        shown = seen(state, batch, renderings)
+        losses = compare(state, batch, shown) | avatar.regularizers(whole, renderings[0], progress)
+        losses |= compare_features(state, batch, shown)
+        if head is not None:
+            losses |= head.losses(progress)
+        with direct_gradients():
+            torch.autograd.backward(list(losses.values()), [own_derivative(loss) for loss in losses.values()])
     if head is not None:
         head.after_backward(progress, renderings)
 
-    changed = _update(state, settings, batch, progress, posed, renderings)
+    changed = _update(state, settings, batch, progress, groups, posed, renderings)
+    if changed:
+        _native.release_memory()  # Blocks of the sizes that tensors had are of no use.
     state.step = progress.done
     if head is not None:
         _after_update(state, head, data, progress, changed=changed)
@@ -328,7 +341,13 @@ def step(state: TrainingState, data: TrainingData, settings: TrainSettings) -> s
     state.seconds += elapsed
     if not progress.reaches(settings.record_every) and state.step != settings.steps:
         return ""
+    losses = losses or summed(parts, len(batch))
     return _record(state, losses, train_psnr(shown[0], batch[0].target), elapsed * 1000 / len(batch))
+
+
+def _groups(state: TrainingState, batch: Items[BatchFrame]) -> list[ParameterGroup]:
+    groups = [*state.avatar.parameter_groups(), *face_groups(state, batch)]
+    return groups + [group for own in state.colors for group in own.learned.parameter_groups()]
 
 
 def _update(
@@ -336,16 +355,15 @@ def _update(
     settings: TrainSettings,
     batch: Items[BatchFrame],
     progress: Progress,
+    groups: Items[ParameterGroup],
     posed: Items[Posed],
     renderings: Items[Rendering],
 ) -> bool:
     """Update all trained tensors, then add and prune Gaussians. Returns whether the Gaussians may have changed."""
-    groups = [*state.avatar.parameter_groups(), *face_groups(state, batch)]
-    groups += [group for own in state.colors for group in own.learned.parameter_groups()]
     if state.density is not None:
         for own, rendering in zip(posed, renderings, strict=True):
             state.density.observe(own, rendering)
-    state.adam.step(groups, progress)
+    state.adam.step(groups, progress, len(batch) if state.avatar.extras.apart else 1)
     for one in batch:
         state.track.confine(one.index)
     if progress.reaches(STEADY_EVERY):

@@ -1,5 +1,5 @@
 from .access import Door as Door
-from .server import address_of as address_of
-from .server import listen as listen
+from .access import address_of as address_of
+from .access import listen as listen
 from .server import serve as serve
 from .session import Session as Session

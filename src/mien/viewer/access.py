@@ -5,17 +5,16 @@ other user of the machine. Requests therefore need a token, which the printed ad
 into a cookie. They also need the origin of the host that they were sent to.
 """
 
+import errno
 import hmac
 import ipaddress
 import secrets
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import SplitResult, parse_qsl, urlsplit
-
-from websockets.datastructures import Headers
-from websockets.http11 import Response
 
 from mien.errors import UserError
 from mien.machine.terminal import printable
@@ -31,9 +30,9 @@ HEADERS: Mapping[str, str] = {
 _PAGE = "index.html"
 """Where the first request is sent on, relative to its address. The name keeps a proxy's sub-path: viser's page connects
 to its own address without the last slash, and proxies answer that with a redirect, which no WebSocket follows."""
-_NO_TOKEN = "This viewer is private. Open the whole address that mien printed, with its token.\n"
+_NO_TOKEN = "This page is private. Open the whole address that mien printed, with its token.\n"
 _STRANGE_ORIGIN = (
-    "This viewer answers only pages of its own: the request came from a page of {origin}, and its Host is {host}. "
+    "This server answers only pages of its own: the request came from a page of {origin}, and its Host is {host}. "
     "Behind a proxy, let the proxy pass on the browser's Host header.\n"
 )
 _STRANGE_HOST = (
@@ -53,8 +52,17 @@ def is_loopback(host: str) -> bool:
 
 
 @dataclass(frozen=True)
+class Answer:
+    """What a request gets in place of what it asked for."""
+
+    status: HTTPStatus
+    headers: Mapping[str, str]
+    body: bytes = b""
+
+
+@dataclass(frozen=True)
 class Door:
-    """The rules of one viewer."""
+    """The rules of one server."""
 
     host: str
     """The host that it listens on."""
@@ -68,7 +76,7 @@ class Door:
             raise UserError(f"--no-token: other machines can reach --host {host}; leave --no-token out")
         return Door(host, secrets.token_urlsafe(18) if with_token else None)
 
-    def answer(self, path: str, headers: Mapping[str, str]) -> Response | None:
+    def answer(self, path: str, headers: Mapping[str, str]) -> Answer | None:
         """None if a request may go on, or what to answer instead. `path` has the query, too."""
         given = {name.lower(): value for name, value in headers.items()}
         host = given.get("host", "")
@@ -86,7 +94,7 @@ class Door:
                 return _refusal(_NO_TOKEN)
             # Without a path, the cookie is for the folder of the address, which may be a proxy's sub-path.
             cookie = f"{self.cookie}; HttpOnly; SameSite=Strict"
-            return _response(HTTPStatus.SEE_OTHER, {"Location": _PAGE, "Set-Cookie": cookie})
+            return Answer(HTTPStatus.SEE_OTHER, {"Location": _PAGE, "Set-Cookie": cookie, "Content-Length": "0"})
         return None if _same(self._token_in(given.get("cookie", "")), self.token) else _refusal(_NO_TOKEN)
 
     def address(self, host: str, port: int) -> str:
@@ -108,13 +116,42 @@ class Door:
         return found.value if found is not None else ""
 
 
-def _refusal(words: str) -> Response:
-    return _response(HTTPStatus.FORBIDDEN, {"Content-Type": "text/plain; charset=utf-8"}, words)
+def listen(host: str, port: int) -> socket.socket:
+    """Listen at a port, or at a free one if it is 0. Browsers that connect wait until a server takes the socket."""
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(place)
+            listener.listen()
+        except OSError:
+            listener.close()
+            raise
+        return listener
+    except (OSError, UnicodeError) as error:
+        number = getattr(error, "errno", None)
+        if number == errno.EADDRINUSE:
+            raise UserError(
+                f"--port {port}: another program uses it; give another port, or leave --port out for a free one"
+            ) from None
+        if number == errno.EACCES:
+            raise UserError(f"--port {port}: is not allowed for this user; give one above 1023") from None
+        raise UserError(
+            f"--host {host}: is no address of this machine; give one of its addresses, or 0.0.0.0 for all"
+        ) from None
 
 
-def _response(status: HTTPStatus, headers: Mapping[str, str], words: str = "") -> Response:
+def address_of(door: Door, listener: socket.socket) -> str:
+    """The address that people open to reach a socket."""
+    host = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
+    return door.address(host, int(listener.getsockname()[1]))
+
+
+def _refusal(words: str) -> Answer:
     body = words.encode()
-    return Response(status.value, status.phrase, Headers({**headers, "Content-Length": str(len(body))}), body)
+    headers = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+    return Answer(HTTPStatus.FORBIDDEN, headers, body)
 
 
 def _parts_of(address: str) -> SplitResult | None:

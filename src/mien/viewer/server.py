@@ -1,7 +1,6 @@
 """The viewer's server: viser shows our pictures behind its controls, and `mien.viewer.access` guards every request."""
 
 import contextlib
-import errno
 import gzip
 import http.client
 import io
@@ -21,10 +20,9 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from mien.errors import UserError
 from mien.machine.terminal import tell
 from mien.plugins import missing_package
-from mien.viewer.access import HEADERS, Door
+from mien.viewer.access import HEADERS, Door, address_of
 from mien.viewer.camera import CameraSwitch
 from mien.viewer.drawing import View
 from mien.viewer.loop import DrawingLoop
@@ -189,38 +187,6 @@ def view_of(camera: viser.CameraHandle) -> View:
     return View(viewmat, float(camera.fov), int(camera.image_width), int(camera.image_height))
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """Listen at a port, or at a free one if it is 0. Browsers that connect wait until a server takes the socket."""
-    try:
-        family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(place)
-            listener.listen()
-        except OSError:
-            listener.close()
-            raise
-        return listener
-    except (OSError, UnicodeError) as error:
-        number = getattr(error, "errno", None)
-        if number == errno.EADDRINUSE:
-            raise UserError(
-                f"--port {port}: another program uses it; give another port, or leave --port out for a free one"
-            ) from None
-        if number == errno.EACCES:
-            raise UserError(f"--port {port}: is not allowed for this user; give one above 1023") from None
-        raise UserError(
-            f"--host {host}: is no address of this machine; give one of its addresses, or 0.0.0.0 for all"
-        ) from None
-
-
-def address_of(door: Door, listener: socket.socket) -> str:
-    """The address that people open to reach a socket."""
-    host = socket.gethostname() if door.host in ("0.0.0.0", "::") else door.host
-    return door.address(host, int(listener.getsockname()[1]))
-
-
 @contextlib.contextmanager
 def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
     """Let servers that start inside listen at a socket, and ask the door about each request. viser cannot do that."""
@@ -232,8 +198,10 @@ def _guarded(door: Door, listener: socket.socket) -> Iterator[None]:
         process_request: Callable[[Any, Request], Response | None], **named: Any,
     ) -> Any:  # fmt: skip
         def process(connection: Any, request: Request) -> Response | None:
-            response = door.answer(request.path, dict(request.headers.raw_items()))
-            if response is None:
+            told = door.answer(request.path, dict(request.headers.raw_items()))
+            if told is not None:
+                response = Response(told.status.value, told.status.phrase, Headers(told.headers), told.body)
+            else:
                 given = process_request(connection, request)
                 response = None if given is None else _adapted(given)
             if response is not None:

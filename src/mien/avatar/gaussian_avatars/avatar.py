@@ -5,6 +5,7 @@ matters. Lengths and scales in the store are in units of the triangle's own scal
 Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
 """
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -56,7 +57,8 @@ class GaussianAvatars(Avatar):
             bases=("feature_bases", *BASES),
             penalties=lambda changes: mean_squares(changes, (config.expression_weight, APPEARANCE_WEIGHT)),
         )
-        super().__init__(config, face_model, face, Extras(surface=surface))
+        extras = Extras(surface=surface, frames_per_step=lambda: config.frames_per_step, apart=True)
+        super().__init__(config, face_model, face, extras)
         like, n = face_model.template, face_model.faces.shape[0]
         trained = {
             "means": like.new_zeros(n, 3),
@@ -145,7 +147,9 @@ class GaussianAvatars(Avatar):
         ]
         if self.appearance is not None:
             groups += self.appearance.parameter_groups(self.store)
-        return groups
+        # The mean gradient of several frames is steadier than that of one, by the root of their number.
+        factor = math.sqrt(config.frames_per_step)
+        return groups if factor == 1 else [replace(group, rate=group.rate.times(factor)) for group in groups]
 
     def density(self) -> GradientDensity:
         """Gradient-based control. Children stay on their parent's triangle; no triangle loses its last Gaussian."""
@@ -214,6 +218,9 @@ def resting_opacities(store: GaussianStore, seen: Float[Tensor, " n"]) -> Float[
 def never_empty_a_triangle(store: GaussianStore, prune: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
     """Allow no prunes on a triangle that would otherwise lose all its Gaussians (section 3.3)."""
     face_index = store["face_index"]
-    kept = torch.zeros(int(face_index.max()) + 1, dtype=torch.bool, device=prune.device)
-    kept[face_index[~prune]] = True
-    return prune & kept[face_index]
+    # Triangles get the numbers of their order, which are below that of Gaussians: nothing is read from a GPU.
+    ordered, order = face_index.sort()
+    numbers = (ordered != ordered.roll(1)).cumsum(0).sub_(1).clamp_min_(0)
+    own = torch.empty_like(order).scatter_(0, order, numbers)
+    kept = torch.zeros_like(own).index_add_(0, own, (~prune).to(own.dtype))
+    return prune & (kept[own] > 0)

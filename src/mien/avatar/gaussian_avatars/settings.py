@@ -26,6 +26,9 @@ class GaussianAvatarsConfig(MethodConfig):
     where they are on average.
     """
 
+    frames_per_step: Annotated[int, Range(1, 64)] = 2
+    """Number of frames of an optimiser step, each on a thread of its own. Learning rates of Gaussians grow with the
+    root of it, and Adam's running means decay by frames."""
     photometric: Photometric = Photometric(
         alpha_weight=0.2, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
     )
@@ -85,6 +88,7 @@ frame, by about the rate. The paper's subjects have nine sequences, so some 1,00
 
 
 _PUBLISHED: dict[str, Any] = {
+    "frames_per_step": 1,
     "photometric": {"alpha_weight": 0.0, "part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
     "appearance": "static",
     "expression_rank": 0,

@@ -153,6 +153,7 @@ class HeadGas(Avatar):
 
     def density(self) -> GradientDensity:
         """Gradient-based control. Children copy features. `judged_opacities` says which opacity counts."""
+        self.judged = self.judged.to(self.rest)
         return GradientDensity(self.config.density, opacity_logits=None, judged_opacities=self.judged_opacities)
 
     @torch.no_grad()

@@ -41,6 +41,7 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
 from mien.gaussians import Gaussians, Rendering, sh_from_rgb
+from mien.kernels import on_gpu
 from mien.runtime.baked import AttributeNetwork, Attributes, BlendSkinned
 from mien.runtime.checks import MAX_LOG_SCALE
 
@@ -52,7 +53,7 @@ class MonoGaussianAvatar(FreePoints):
 
     def __init__(self, config: MonoGaussianAvatarConfig, face_model: FaceModel, face: FaceParams):
         pretraining = Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None
-        extras = Extras(frames_per_step=self._frames_per_step, pretraining=pretraining)
+        extras = Extras(frames_per_step=self._frames_per_step, pretraining=pretraining, graph_key=self._graph_key)
         super().__init__(config, face_model, face, extras)
         like = face_model.template
         sizes = (config.attribute_width, config.attribute_layers, config.encoding_bands)
@@ -78,13 +79,24 @@ class MonoGaussianAvatar(FreePoints):
         means, displacement = self.deformed(self.store["means"], face)
         # Detached, as in the published code: attributes do not pull on the points.
         change = self.change(displacement.detach() / LENGTH_UNIT)
-        raw = split_attributes(self._attributes_at_rest() + change)
         radius = self._schedule().rendering_radius(progress.fraction)
+        if on_gpu(means):
+            from mien.avatar.mono_gaussian_avatar.motion_gpu import activated
+
+            own = self.store["own_attributes"] if "own_attributes" in self.store.names() else None
+            found = activated(self._predicted_at_rest(), own, change, self.config.scale_gain, radius)
+            scales, quats, opacities, sh = found
+            return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
+        raw = split_attributes(self._attributes_at_rest() + change)
         scales = self.config.scale_gain * sigmoid(raw["log_scales"]) + radius
         quats = torch.nn.functional.normalize(raw["quats"], dim=-1)
         opacities = sigmoid(raw["opacity_logits"][..., 0])
         sh = sh_from_rgb(sigmoid(raw["sh"]))[..., None, :]
         return Posed(Gaussians(means, quats, scales, opacities, sh, head_poses(face)), {})
+
+    def _graph_key(self, progress: Progress) -> float:
+        """The radius of all points, which changes with the epoch."""
+        return self._schedule().rendering_radius(progress.fraction)
 
     def _frames_per_step(self) -> int:
         """Fewer than the settings' if there are many points."""
@@ -92,9 +104,7 @@ class MonoGaussianAvatar(FreePoints):
 
     def regularizers(self, posed: Posed, rendering: Rendering, progress: Progress) -> dict[str, Float[Tensor, ""]]:
         """`face_losses` of the next points, whose weight falls. They train the networks only."""
-        losses = self.face_losses(self.chosen_means(progress))
-        weight = self._schedule().face_decay(progress.fraction)
-        return {name: weight * loss for name, loss in losses.items()}
+        return self.face_losses(self.chosen_means(progress), self._schedule().face_decay(progress.fraction))
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """One group for the points, and one per network."""
@@ -162,8 +172,11 @@ class MonoGaussianAvatar(FreePoints):
 
     def _attributes_at_rest(self) -> Float[Tensor, "n 11"]:
         """Raw attributes that the network predicts for the points' positions, and what each point adds to them."""
-        raw = self.attributes(self.store["means"].detach() / LENGTH_UNIT)
+        raw = self._predicted_at_rest()
         return raw + self.store["own_attributes"] if "own_attributes" in self.store.names() else raw
+
+    def _predicted_at_rest(self) -> Float[Tensor, "n 11"]:
+        return self.attributes(self.store["means"].detach() / LENGTH_UNIT)
 
     def _schedule(self) -> Schedule:
         config = self.config

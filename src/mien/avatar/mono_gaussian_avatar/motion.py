@@ -24,6 +24,7 @@ from mien.avatar.ops.skin_points import blend_transforms, skin_points, unskin
 from mien.avatar.settings import Progress
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.kernels import on_gpu
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 from mien.runtime.baked import Rig
 
@@ -45,6 +46,7 @@ class AtRest(NamedTuple):
     vertices: Float[Tensor, "v 3"]
     transforms: Float[Tensor, "k 3 4"]
     coefficients: Float[Tensor, "1 c"]
+    T_world_head: Float[Tensor, "4 4"]
 
 
 class BakedMotion(NamedTuple):
@@ -68,10 +70,14 @@ class FreePoints(Avatar, ABC):
     expression_variance: Tensor
     bones: Int[Tensor, " s"]
     """Joints that move skin. The others only place these: FLAME has five here, and nine that move nothing."""
+    slots: Int[Tensor, " k"]
+    """The place of each joint among these, or -1."""
 
     def new_deformation(self, face: FaceParams, form: WeightNorm) -> DeformationNet:
         """The network for faces of this kind, with random weights."""
-        self.register_buffer("bones", self.face_model.skinning_weights.any(0).nonzero()[:, 0], persistent=False)
+        moved = self.face_model.skinning_weights.any(0)
+        self.register_buffer("bones", moved.nonzero()[:, 0], persistent=False)
+        self.register_buffer("slots", torch.where(moved, moved.cumsum(0) - 1, -1), persistent=False)
         outputs = (face.expression.shape[1], 9 * face.joints.shape[1], len(self.bones) + 1)
         return DeformationNet(self.config.deformation_width, *outputs, form).to(self.face_model.template)
 
@@ -82,7 +88,7 @@ class FreePoints(Avatar, ABC):
         self.register_buffer("canonical_expression", expression)
         self.register_buffer("canonical_joints", joints)
         self.register_buffer("expression_variance", face.expression.detach().var(0, correction=0))
-        self._kept_rest = Kept[AtRest]()
+        self._kept_rest, self._kept_surface = Kept[AtRest](), Kept[Any]()
         if config.start == "sphere":
             # Uniform in a cube, then projected onto the sphere, as in the published code.
             cube = 2 * torch.rand(config.points, 3).to(like) - 1
@@ -106,7 +112,7 @@ class FreePoints(Avatar, ABC):
         def make() -> AtRest:
             face = self.canonical_face()
             vertices, transforms = self.face_model.head_vertices(face)[0], self.transforms(face)[0]
-            return AtRest(vertices, transforms, self.coefficients(face, absolute=True))
+            return AtRest(vertices, transforms, self.coefficients(face, absolute=True), face.T_world_head[0])
 
         own = (self.canonical_expression, self.canonical_joints, *self.subject.tensors().values())
         return self._kept_rest.of(own, make)
@@ -120,44 +126,92 @@ class FreePoints(Avatar, ABC):
         self, means: Float[Tensor, "n 3"], face: FaceParams
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Points in the head frame, and their motion from the canonical positions, both in metres."""
+        if on_gpu(means, face.expression):
+            found = self._moved_by_kernels(means, face)
+            if found is not None:
+                return found
         offset, moved, weights = self.deformation(means / LENGTH_UNIT, self.coefficients(face))
         canonical = means + LENGTH_UNIT * offset
         at_rest = self.at_rest().transforms
         posed = skin_points(canonical, LENGTH_UNIT * moved, weights, at_rest, self.transforms(face))
         return posed, posed - canonical
 
-    def face_losses(self, means: Float[Tensor, "p 3"]) -> dict[str, Float[Tensor, ""]]:
+    def _moved_by_kernels(self, means: Float[Tensor, "n 3"], face: FaceParams) -> tuple[Tensor, Tensor] | None:
+        """`deformed` in few launches. None if the person's shape has a gradient."""
+        from mien.avatar.mono_gaussian_avatar.motion_gpu import moved_points
+        from mien.face.posing_gpu import move_bones
+
+        rest = self.at_rest()
+        found = move_bones(self.face_model, face, rest.T_world_head, self.slots, len(self.bones) + 1)
+        if found is None:
+            return None
+        coefficients, bones = found
+        outputs = self.deformation.outputs(means / LENGTH_UNIT, coefficients - rest.coefficients)
+        return moved_points(outputs, means, rest.transforms, bones)
+
+    def face_losses(self, means: Float[Tensor, "p 3"], share: float = 1.0) -> dict[str, Float[Tensor, ""]]:
         """Weighted distances of points' skinning weights and directions from those of the nearest canonical vertex.
 
         With units of a mean variance of 1, the term of expressions does not depend on how a face model scales its
         coefficients (the paper's weight is for FLAME). Nearest vertices are found in each step, because points move.
+        `share` is a factor on all weights.
         """
         model = self.face_model
+        if on_gpu(means):
+            return self._face_losses_by_kernels(means, share)
         found = self.deformation.whole(means / LENGTH_UNIT)
         canonical = means + LENGTH_UNIT * found.offset.detach()
         nearest = nearest_vertices(canonical, self.at_rest().vertices)
         # The bone that stands still belongs to no vertex.
         weights = torch.nn.functional.pad(model.skinning_weights[nearest][:, self.bones], (0, 1))
-        config, variance = self.config, self.expression_variance
+        config, units = self.config, self._units()
         losses = {"skinning": config.face_skinning_weight * _mean_square(found.weights - weights)}
         difference = found.expression - model.expression_basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
-        unit = variance.mean().clamp_min(1e-8)
-        if config.face_expression_units == "each":
-            # Coefficients that never moved would otherwise have an infinite weight.
-            unit = unit / ((variance / unit).clamp_min(0.01) * len(variance))
-        difference = difference if config.face_expression_units == "own" else difference * unit.sqrt()
+        difference = difference if units is None else difference * units
         losses["expression_directions"] = config.face_expression_weight * _mean_square(difference)
         if found.pose.shape[-1] > 0:
             basis = model.pose_basis
             correctives = 0 if basis is None else basis[:, nearest].permute(1, 2, 0) / LENGTH_UNIT
             losses["pose_correctives"] = config.face_correctives_weight * _mean_square(found.pose - correctives)
-        return losses
+        return losses if share == 1 else {name: share * loss for name, loss in losses.items()}
+
+    def _units(self) -> Float[Tensor, "*e"] | None:
+        """Factors on differences of directions, by the settings."""
+        config, variance = self.config, self.expression_variance
+        if config.face_expression_units == "own":
+            return None
+        unit = variance.mean().clamp_min(1e-8)
+        if config.face_expression_units == "each":
+            # Coefficients that never moved would otherwise have an infinite weight.
+            unit = unit / ((variance / unit).clamp_min(0.01) * len(variance))
+        return unit.sqrt()
+
+    def _face_losses_by_kernels(self, means: Float[Tensor, "p 3"], share: float) -> dict[str, Float[Tensor, ""]]:
+        """`face_losses` in few launches."""
+        from mien.avatar.mono_gaussian_avatar.motion_gpu import Surface, face_distances
+
+        config, model, rest = self.config, self.face_model, self.at_rest()
+
+        def surface() -> Surface:
+            bases = [model.expression_basis] if model.pose_basis is None else [model.expression_basis, model.pose_basis]
+            units, variance = self._units(), self.expression_variance
+            units = torch.ones_like(variance) if units is None else units.expand_as(variance).contiguous()
+            return Surface(rest.vertices, torch.cat(bases), model.skinning_weights.contiguous(), self.bones, units)
+
+        weights = (config.face_skinning_weight, config.face_expression_weight, config.face_correctives_weight)
+        outputs = self.deformation.outputs(means / LENGTH_UNIT)
+        own = self._kept_surface.of((rest.vertices, self.expression_variance), surface)
+        skinning, expression, pose = (share * weight for weight in weights)
+        losses = face_distances(outputs, means, own, (skinning, expression, pose))
+        names = ("skinning", "expression_directions", "pose_correctives")[: 3 if self.deformation.pose_features else 2]
+        return dict(zip(names, losses, strict=False))
 
     def chosen_means(self, progress: Progress) -> Float[Tensor, "p 3"]:
         """The next `face_points` points, detached: on average, losses of them are the paper's means over all points."""
-        n, count, turn = len(self.store), self.config.face_points, progress.step // progress.frames
-        means, last = self.store["means"].detach(), turn * count + min(count, n)
-        return means[torch.arange(turn * count, last, device=means.device) % n]
+        n, turn = len(self.store), progress.step // progress.frames
+        means, first, count = self.store["means"].detach(), turn * self.config.face_points % n, self.config.face_points
+        chosen, more = means[first : first + count], min(count, n) - (n - first)
+        return torch.cat([chosen, means[:more]]) if more > 0 else chosen
 
     def baked_motion(self) -> BakedMotion:
         """The points as those of a rig with blend directions and skinning weights."""

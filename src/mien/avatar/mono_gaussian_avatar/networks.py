@@ -17,10 +17,11 @@ from torch.nn.functional import pad
 from torch.nn.utils.parametrizations import weight_norm
 
 from mien.avatar.mono_gaussian_avatar.settings import WeightNorm
-from mien.avatar.ops.point_network import Activation, Layer, point_network
+from mien.avatar.ops.point_network import Activation, Layer, PlannedLayer, Rows, point_network
 from mien.avatar.ops.points import positional_encoding
+from mien.kernels import on_gpu
 
-_SKINNING_SHARPNESS = 20.0
+SKINNING_SHARPNESS = 20.0
 """Factor on the logits of the skinning weights: their softmax has a temperature of 1/20. As published."""
 _SPHERE_RADIUS = 0.6  # radius of the sphere whose distance a network gives at the start. As published
 
@@ -85,7 +86,22 @@ class AttributeNet(nn.Module):
 
     def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 11"]:
         """Columns as in `ATTRIBUTES`."""
-        return point_network(positional_encoding(points, self.bands), self.layers())
+        encoded = positional_encoding(points, self.bands)
+        return _on_gpu(encoded, self.plan()) if on_gpu(points) else point_network(encoded, self.layers())
+
+    def plan(self) -> list[PlannedLayer]:
+        """The same layers for a GPU, which multiplies none."""
+        plan = [PlannedLayer([Rows(_as_linear(layer))], "softplus") for layer in self.trunk]
+        if self.skip is not None:
+            plan[self.skip] = plan[self.skip]._replace(extra=0, scale=1 / math.sqrt(2))
+        heads = [Rows(_as_linear(head)) for head in self.heads]
+        color, width = _as_linear(self.color), self.color.out_features
+        second = Rows(color, (len(heads) - 1) * width)
+        # The last layer reads the second layer of the colour, and after it the heads.
+        last = [Rows(_as_linear(output), (1 + index) * width) for index, output in enumerate(self.outputs)]
+        last[-1] = Rows(last[-1].linear)
+        plan += [PlannedLayer(heads, "softplus"), PlannedLayer([second], "softplus" if self.every else "none")]
+        return [*plan, PlannedLayer(last, extra=len(plan) - 1)]
 
 
 class Deformation(NamedTuple):
@@ -132,7 +148,27 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight, bias))
         offset, moved, logits = outputs.split([3, 3 * len(coefficients), self.skinning.out_features], dim=-1)
         moved = moved.unflatten(-1, (-1, 3)).transpose(0, 1)
-        return offset, moved, (_SKINNING_SHARPNESS * logits).softmax(-1)
+        return offset, moved, (SKINNING_SHARPNESS * logits).softmax(-1)
+
+    def outputs(self, points: Float[Tensor, "n 3"], coefficients: Float[Tensor, "b c"] | None = None) -> Tensor:
+        """Offsets, sums of directions, and logits of skinning weights of points on a GPU.
+
+        Without coefficients, each number of an offset and its directions lie side by side.
+        """
+        from mien.avatar.ops.point_network_gpu import packed, packed_network, structure_of, summed_directions
+
+        plan = self.plan()
+        structure = structure_of(3, plan)
+        parameters = packed(plan, structure)
+        if coefficients is not None:
+            parameters, structure = summed_directions(parameters, coefficients, structure)
+        return packed_network(points, parameters, structure)
+
+    def plan(self) -> list[PlannedLayer]:
+        """The layers of `whole` for a GPU."""
+        trunk = [PlannedLayer([Rows(_as_linear(layer))], "softplus") for layer in self.trunk]
+        last = [Rows(self.directions, _as_linear(self.hidden).out_features), Rows(self.skinning)]
+        return [*trunk, PlannedLayer([Rows(_as_linear(self.hidden))], "softplus"), PlannedLayer(last, extra=len(trunk))]
 
     def whole(self, points: Float[Tensor, "n 3"]) -> Deformation:
         """Everything about some points, with every direction."""
@@ -141,7 +177,7 @@ class DeformationNet(nn.Module):
         outputs = point_network(points, self._layers(weight.flatten(0, 1), bias.flatten()))
         directions, logits = outputs.split([3 * sum(widths), self.skinning.out_features], dim=-1)
         offset, expression, pose = directions.unflatten(-1, (3, -1)).split(widths, dim=-1)
-        return Deformation(offset[..., 0], expression, pose, (_SKINNING_SHARPNESS * logits).softmax(-1))
+        return Deformation(offset[..., 0], expression, pose, (SKINNING_SHARPNESS * logits).softmax(-1))
 
     def _directions(self) -> tuple[Float[Tensor, "3 _ w"], Float[Tensor, "3 _"]]:
         return self.directions.weight.unflatten(0, (3, -1)), self.directions.bias.unflatten(0, (3, -1))
@@ -168,7 +204,19 @@ class AttributeChangeNet(nn.Module):
 
     def forward(self, displacement: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 11"]:
         """Columns as in `ATTRIBUTES`."""
-        return point_network(displacement.flatten(0, -2), self.layers()).unflatten(0, displacement.shape[:-1])
+        points = displacement.flatten(0, -2)
+        outputs = _on_gpu(points, self.plan()) if on_gpu(points) else point_network(points, self.layers())
+        return outputs.unflatten(0, displacement.shape[:-1])
+
+    def plan(self) -> list[PlannedLayer]:
+        """The same layers for a GPU, which multiplies none."""
+        activations: list[Activation] = ["relu", "relu", "relu" if self.every else "none"]
+        plan = [
+            PlannedLayer([Rows(_as_linear(layer))], own) for layer, own in zip(self.trunk, activations, strict=True)
+        ]
+        width = _as_linear(self.heads[0]).out_features
+        last = [Rows(_as_linear(output), index * width) for index, output in enumerate(self.outputs)]
+        return [*plan, PlannedLayer([Rows(_as_linear(head)) for head in self.heads], "relu"), PlannedLayer(last)]
 
     def layers(self) -> list[Layer]:
         """An equivalent plain network with ReLU between all of its layers."""
@@ -180,6 +228,13 @@ class AttributeChangeNet(nn.Module):
         # There is no activation after the third layer, as in the published code: it and the next are one linear map.
         joined = Layer(fan_out.weight @ third.weight, fan_out.weight @ third.bias + fan_out.bias, "relu")
         return [*trunk, joined, last]
+
+
+def _on_gpu(inputs: Float[Tensor, "n i"], plan: Sequence[PlannedLayer]) -> Float[Tensor, "n o"]:
+    from mien.avatar.ops.point_network_gpu import packed, packed_network, structure_of
+
+    structure = structure_of(inputs.shape[1], plan)
+    return packed_network(inputs, packed(plan, structure), structure)
 
 
 def _beside(layers: list[nn.Linear], activation: Activation) -> Layer:

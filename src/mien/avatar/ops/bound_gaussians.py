@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mien import _native
-from mien.arrays import recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, recycled_twice, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.activation import sigmoid
 from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
@@ -94,20 +94,22 @@ class _BoundGaussians(torch.autograd.Function):
     def forward(ctx: Any, data: Any, topology: Any, in_head: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
         arrays = [tensor.contiguous() for tensor in inputs]
         count = len(arrays[-1])
-        means, quats, scales = (recycled(count, width) for width in (3, 4, 3))
-        opacities, head_pose = recycled(count), recycled(4, 4)
+        means, quats, head_pose = recycled(count, 3), recycled(count, 4), recycled(4, 4)
+        (scales, kept_scales), (opacities, kept_opacities) = recycled_twice((count, 3)), recycled_twice((count,))
         known = unpacked(*arrays, means, quats, scales, opacities, head_pose)
         face, local = _native.FaceArrays(*known[:6]), _native.LocalGaussians(*known[6:10])
         posed = _native.PosedGaussians(*known[10:])
         ctx.ride = _native.ride(data, topology, in_head, face, local, posed)
         ctx.data, ctx.topology, ctx.in_head = data, topology, in_head
-        ctx.save_for_backward(*arrays, scales, opacities)
+        # PyTorch would make a tensor of each that it saves, and look whether other threads changed what shares memory
+        # with it: rows of one track.
+        ctx.inputs, ctx.arrays, ctx.posed = inputs, arrays, (kept_scales, kept_opacities)
         return (means, quats, scales, opacities, head_pose) if in_head else (means, quats, scales, opacities)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        *saved, scales, opacities = ctx.saved_tensors
+        saved, (scales, opacities) = ctx.arrays, ctx.posed
         moves_face = any(ctx.needs_input_grad[5:9])
         of_face = [recycled_like(tensor) if moves_face else None for tensor in saved[2:6]]
         of_gaussians = [recycled_like(tensor) for tensor in saved[6:]]
@@ -126,4 +128,4 @@ class _BoundGaussians(torch.autograd.Function):
             _native.LocalGaussians(*known[15:19]),
             _native.FaceParameterGradients(*unpacked(*of_face)) if moves_face else None,
         )
-        return None, None, None, None, None, *of_face, *of_gaussians
+        return None, None, None, *left_to_autograd(ctx.inputs, [None, None, *of_face, *of_gaussians])

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from mien import _native
 from mien.adam import FactoredGradient, FactoredTerm
-from mien.arrays import left_to_autograd, recycled, recycled_like, unpacked
+from mien.arrays import left_to_autograd, recycled, recycled_like, recycled_twice, unpacked
 from mien.avatar.ops import Tensors
 from mien.avatar.ops.bound_gaussians import LOCAL, pose_bound_gaussians, prepare_posing
 from mien.avatar.ops.feature_network import Layers, feature_network
@@ -131,10 +131,12 @@ class _ChangedGaussians(torch.autograd.Function):
         sh, bases, neutral = arrays[_SH], arrays[_BASES_AT], arrays[14]
         assert sh is not None
         count = len(sh)
-        posed = [*(recycled(count, width) for width in (3, 4, 3)), recycled(count), recycled(4, 4)]
-        found = [None if basis is None else recycled(*basis.shape[:-1]) for basis in bases]
-        found += [None, None] if neutral is None else [recycled(count, 3), recycled(count)]
-        changed = [recycled_like(sh), *found, recycled(), recycled()]
+        shapes = [(count, 3), (count, 4), (count, 3), (count,), (4, 4), tuple(sh.shape)]
+        shapes += [None if basis is None else tuple(basis.shape[:-1]) for basis in bases]
+        shapes += [None, None] if neutral is None else [(count, 3), (count,)]
+        pairs = [(None, None) if shape is None else recycled_twice(shape) for shape in (*shapes, (), ())]
+        returned, kept = map(list, zip(*pairs, strict=True))
+        posed, changed = returned[:5], returned[5:]
         ctx.ride = _native.ride(
             data, topology, in_head, *_posing_groups(arrays), _native.PosedGaussians(*unpacked(*posed)),
             _change_arrays(arrays, changes), _native.ChangedArrays(*unpacked(*changed)), changes.weights,
@@ -142,17 +144,15 @@ class _ChangedGaussians(torch.autograd.Function):
         ctx.fixed, ctx.rows = (data, topology, in_head, changes), rows
         ctx.neutral = inputs[14] if neutral is not None and neutral.is_leaf else None
         ctx.set_materialize_grads(False)
-        # PyTorch would make a tensor of each that it saves. Those that are returned are kept without their history,
-        # since they would otherwise keep themselves.
-        ctx.inputs, ctx.arrays = inputs, arrays
-        ctx.found = [None if one is None else one.data for one in (*posed[2:4], *changed)]
+        # PyTorch would make a tensor of each that it saves.
+        ctx.inputs, ctx.arrays, ctx.found = inputs, arrays, kept[2:4] + kept[5:]
         linear = changed[-2] if any(basis is not None for basis in bases) else None
         return (
             *posed[:4],
             posed[4] if in_head else None,
             *changed[:-2],
             linear,
-            changed[-1] if found[-1] is not None else None,
+            changed[-1] if neutral is not None else None,
         )
 
     @staticmethod

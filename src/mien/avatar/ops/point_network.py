@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from mien import _native
@@ -17,7 +17,7 @@ from mien.arrays import native, recycled, recycled_like, unpacked
 SHARPNESS = 100.0
 """Sharpness of the softplus: ln(1 + exp(100 x)) / 100."""
 Activation = Literal["none", "relu", "softplus"]
-_CODES: dict[Activation, int] = {"none": 0, "relu": 1, "softplus": 2}
+CODES: dict[Activation, int] = {"none": 0, "relu": 1, "softplus": 2}
 _LANES = 16
 
 
@@ -29,6 +29,23 @@ class Layer(NamedTuple):
     activation: Activation = "none"
     extra: int | None = None
     """Whose values are read after those of the previous layer: 0 for the inputs, 1 for the first layer, and so on."""
+
+
+class Rows(NamedTuple):
+    """Rows of a layer: a linear layer, with weight normalisation or without, that reads the inputs from a column on."""
+
+    linear: nn.Linear
+    column: int = 0
+
+
+class PlannedLayer(NamedTuple):
+    """A layer whose weights come from parameters of modules. The other fields are as in `Layer`."""
+
+    rows: Sequence[Rows]
+    activation: Activation = "none"
+    extra: int | None = None
+    scale: float = 1.0
+    """Factor on the weights, but not on the bias."""
 
 
 def point_network_reference(inputs: Float[Tensor, "n i"], layers: Sequence[Layer]) -> Float[Tensor, "n o"]:
@@ -47,7 +64,7 @@ def point_network(inputs: Float[Tensor, "n i"], layers: Sequence[Layer]) -> Floa
     Native for float32 on a CPU: one call forward and one backward, which skips points without gradients. The result
     does not depend on the number of threads.
     """
-    structure = tuple((_CODES[layer.activation], -1 if layer.extra is None else layer.extra) for layer in layers)
+    structure = tuple((CODES[layer.activation], -1 if layer.extra is None else layer.extra) for layer in layers)
     return _PointNetwork.apply(structure, inputs, *(tensor for layer in layers for tensor in layer[:2]))
 
 

@@ -1,10 +1,8 @@
-"""Measure how fast a synthetic head that fills half of the picture is rendered (`mien bench render` and `scaling`)."""
+"""Measure how fast a synthetic head that fills half of the picture is rendered (`mien bench render`)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,14 +11,11 @@ from mien import _native
 from mien.camera import Camera
 from mien.gaussians import Gaussians
 from mien.lab.benchmarking.timing import BenchmarkRow, benchmark_row, rows_by_threads, time_function
-from mien.machine.terminal import counted
-from mien.pages.pages import Axes, Series, write_chart
 from mien.render import rasterize
 
-COUNTS = (10_000, 30_000, 100_000, 300_000)
+COUNTS = (10_000, 30_000, 100_000)
 PAPER_SIZES = {"HeadGaS's figure": (512, 512), "GaussianAvatars' table": (550, 802)}
 """Width and height in pixels (the papers' 802x550 is height x width), by where that size is reported."""
-SIZES = (*PAPER_SIZES.values(), (1024, 1024), (2048, 2048))
 GPU_COUNTS = (30_000, 100_000)
 
 
@@ -90,7 +85,7 @@ def drawing_rows(count: int, size: tuple[int, int], seconds: float) -> Iterator[
 
 def render_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
     """Measure 10,000 to 100,000 Gaussians at two sizes by threads, then 30,000 at 512x512 by instruction set."""
-    for count in COUNTS[:3]:
+    for count in COUNTS:
         for size in ((512, 512), (1024, 1024)):
             yield from drawing_rows(count, size, seconds)
     best, scene = _native.rasterize_isa(), head_scene(30_000, 512, 512)
@@ -104,13 +99,6 @@ def render_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
         _native.set_rasterize_isa(best)
 
 
-def scaling_suite(seconds: float = 0.8) -> Iterator[BenchmarkRow]:
-    """Measure 10,000 to 300,000 Gaussians at the papers' sizes and up to 2048x2048, by threads."""
-    for size in SIZES:
-        for count in COUNTS:
-            yield from drawing_rows(count, size, seconds)
-
-
 def gpu_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
     """Measure the same on the device of `like`, at the papers' sizes."""
     for count in GPU_COUNTS:
@@ -119,24 +107,3 @@ def gpu_rows(like: Tensor, seconds: float) -> Iterator[BenchmarkRow]:
             for name, work in (("forward", scene.draw), ("forward_backward", scene.draw_and_differentiate)):
                 timing = time_function(work, seconds, like=like)
                 yield benchmark_row(f"rasterize_{name}", count, size, timing, like)
-
-
-def write_scaling_chart(path: Path, rows: Sequence[BenchmarkRow]) -> None:
-    """Write a .svg of milliseconds over the number of Gaussians: a chart per kind of row, a line per size."""
-    charts = []
-    for name, threads in dict.fromkeys((row.name, row.threads) for row in rows):
-        own = [row for row in rows if (row.name, row.threads) == (name, threads)]
-        sizes, styles = dict.fromkeys((row.width, row.height) for row in own), ("main", "second", "third", "fourth")
-        lines = [[row for row in own if (row.width, row.height) == size] for size in sizes]
-        series = [
-            Series(
-                f"{line[0].width}x{line[0].height}",
-                np.array([row.gaussians for row in line], np.float64),
-                np.array([row.min_ms for row in line]),
-                style,
-            )
-            for line, style in zip(lines, styles, strict=False)
-        ]
-        title = f"{name.replace('_', ' ')}, {counted(threads, 'thread')}: milliseconds, least"
-        charts.append((title, series, Axes("Gaussians", "milliseconds, least", 640, 320, logarithmic=True)))
-    write_chart(path, charts)

@@ -19,7 +19,7 @@ from mien.face.model import FaceModel
 from mien.lab.benchmarking import train_step
 from mien.lab.benchmarking.timing import thread_counts
 from mien.machine.terminal import counted
-from mien.training import trainer
+from mien.training import apart, trainer
 from mien.training.checkpoint import TrainingState
 from mien.training.settings import PRESETS, TrainSettings, resolved
 from mien.training.trainer import TrainingData, start, step
@@ -29,13 +29,13 @@ COUNT, SIZE = 45_000, (512, 512)
 ROUND = 48
 """Number of steps that are measured together: rare losses are due in the same number of them each time."""
 REST = "Python and PyTorch"
-_PHASES: dict[str, tuple[Any, str]] = {
-    "frame": (trainer, "next_batch"),
-    "pose and draw": (trainer, "draw"),
-    "losses of pictures": (trainer, "compare"),
-    "perceptual loss": (trainer, "compare_features"),
-    "backward": (torch.autograd, "backward"),
-    "update": (trainer, "_update"),
+_PHASES: dict[str, tuple[tuple[Any, str], ...]] = {
+    "frame": ((trainer, "next_batch"),),
+    "pose and draw": ((trainer, "draw"), (apart, "draw")),
+    "losses of pictures": ((trainer, "compare"), (apart, "compare")),
+    "perceptual loss": ((trainer, "compare_features"), (apart, "compare_features")),
+    "backward": ((torch.autograd, "backward"), (torch.autograd, "grad")),
+    "update": ((trainer, "_update"),),
 }
 """The parts of `trainer.step`, by name: where each function is looked up, and its name there."""
 _OF_WHOLE_HEADS = {
@@ -117,6 +117,9 @@ def format_parts(rows: list[PartRow]) -> str:
         lines.append(f"  {phase:42} {ms:8.2f} ms {100 * ms / whole:5.1f} %")
         own = sorted((row for row in rows if row.phase == phase), key=lambda row: -row.ms)
         lines += [f"    {row.operation:40} {row.ms:8.2f} ms {100 * row.ms / whole:5.1f} %" for row in own]
+    drawn = sum(row.ms for row in rows if row.operation.startswith("rasterize_views"))
+    if drawn:
+        lines.append(f"{'a step over its rasterizer':44} {whole / drawn:8.2f} times")
     return "\n".join(lines)
 
 
@@ -189,8 +192,9 @@ def _watched(watch: Stopwatch, state: TrainingState) -> Iterator[None]:
     with ExitStack() as stack:
         for name, phase in _OF_WHOLE_HEADS.items():
             stack.enter_context(patch.object(state.head, name, watch.phase(phase, getattr(state.head, name))))
-        for name, (room, function) in _PHASES.items():
-            stack.enter_context(patch.object(room, function, watch.phase(name, getattr(room, function))))
+        for name, places in _PHASES.items():
+            for room, function in places:
+                stack.enter_context(patch.object(room, function, watch.phase(name, getattr(room, function))))
         for name in dir(_native):
             operation = getattr(_native, name)
             if callable(operation) and not isinstance(operation, type) and not name.startswith("_"):

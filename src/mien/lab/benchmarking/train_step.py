@@ -31,7 +31,7 @@ SETTINGS = TrainSettings(
     steps=1_000_000_000, split="none", background="white", edges="filmed", inside="free", unseen="trained"
 )
 """So many steps that no density control happens during the measurement, and no part of a run that closes heads."""
-_ON_CPU = torch.zeros(())
+ON_CPU = torch.zeros(())
 
 
 def train_step_suite(seconds: float = 3.0) -> Iterator[BenchmarkRow]:
@@ -96,7 +96,7 @@ def pose_and_render(avatar: Avatar, face: FaceParams, camera: Camera) -> None:
 
 
 def training_case(
-    face_model: FaceModel, count: int, width: int, height: int, like: Tensor = _ON_CPU
+    face_model: FaceModel, count: int, width: int, height: int, like: Tensor = ON_CPU
 ) -> tuple[TrainingState, TrainingData]:
     """Return a state in the middle of a run with `count` Gaussians, and its pictures, half of which the head covers.
 
@@ -112,7 +112,7 @@ def training_case(
     return state, case_data(sequence, like=like)
 
 
-def case_data(sequence: Sequence, settings: TrainSettings = SETTINGS, like: Tensor = _ON_CPU) -> TrainingData:
+def case_data(sequence: Sequence, settings: TrainSettings = SETTINGS, like: Tensor = ON_CPU) -> TrainingData:
     """Return the pictures of a case in a training's order."""
     order = FrameOrder(training_frames([sequence], settings), seed=0)
     return TrainingData(order, (Targets(sequence, 0, like=like, cleaned=settings.edges == "cleaned"),))
@@ -165,7 +165,7 @@ def benchmark_sequence(face_model: FaceModel, width: int, height: int) -> Sequen
     return Sequence("benchmark", capture, tracking, np.zeros(pictures.shape[:-1], np.uint8))
 
 
-def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor = _ON_CPU) -> None:
+def paint_targets(sequence: Sequence, avatar: Avatar, like: Tensor = ON_CPU) -> None:
     """Paint pictures of the same head in noisy colours, so that every loss has a gradient."""
     noise = np.random.default_rng(0)
     for timestep in range(TIMESTEPS):

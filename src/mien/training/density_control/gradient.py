@@ -38,7 +38,15 @@ from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.gaussians import Rendering
 from mien.kernels import on_gpu
-from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
+from mien.machine.devices import upload
+from mien.training.density_control.strategy import (
+    DensityStrategy,
+    Random,
+    Redundant,
+    count_each,
+    places_in,
+    with_most_visible,
+)
 
 PRUNE_OPACITY = 0.005  # opacity below which Gaussians are removed. Of 3D Gaussian Splatting
 RESET_OPACITY = 0.01  # highest opacity that remains after a reset. Of 3D Gaussian Splatting
@@ -126,22 +134,20 @@ class GradientStrategy(DensityStrategy):
         prune = self._to_prune(store, sizes, progress)
         if self._density.may_prune is not None and "never_empty" not in off:
             prune = self._density.may_prune(store, prune)
-        if bool(prune.all()):
-            # Without any Gaussian there are no gradients to grow by, so keep the one that was most visible.
-            prune[self._highest_opacities.argmax()] = False
+        # Without any Gaussian there are no gradients to grow by.
+        staying = with_most_visible(~prune, self._highest_opacities)
         large = sizes > settings.split_size
-        may_grow = ~prune & torch.where(large, "split" not in off, "clone" not in off)
-        grow = self._to_grow(may_grow, len(prune) if "cap" in off else settings.max_gaussians - int((~prune).sum()))
-        split = grow & large
-        parents = (grow & ~split).nonzero()[:, 0]
-        store.append(parents)
+        may_grow = staying & torch.where(large, "split" not in off, "clone" not in off)
+        grow = self._to_grow(may_grow, None if "cap" in off else settings.max_gaussians - staying.sum())
+        split, n = grow & large, len(store)
+        staying &= ~split
+        copied, divided, old = count_each(grow & ~split, split, staying)
+        store.append(places_in(grow & ~split, copied))
         # Both children of a split replace their parent.
-        parents = split.nonzero()[:, 0].repeat(2)
-        noise = torch.randn(len(parents), 3, generator=random).to(sizes)
+        parents = places_in(split, divided).repeat(2)
+        noise = upload(torch.randn(len(parents), 3, generator=random), sizes)
         store.append(parents, self._density.split(store, parents, noise))
-        kept = torch.ones(len(store), dtype=torch.bool, device=prune.device)
-        kept[: len(prune)] = ~(prune | split)
-        store.select(kept)
+        store.select(torch.cat([places_in(staying, old), torch.arange(n, len(store), device=prune.device)]))
 
     def _to_prune(self, store: GaussianStore, sizes: Float[Tensor, " n"], progress: Progress) -> Bool[Tensor, " n"]:
         settings, off = self._density.settings, self._density.settings.rules_off
@@ -160,14 +166,15 @@ class GradientStrategy(DensityStrategy):
                 prune = prune | (self._largest_radii > settings.prune_radius)
         return prune
 
-    def _to_grow(self, candidates: Bool[Tensor, " n"], budget: int) -> Bool[Tensor, " n"]:
+    def _to_grow(self, candidates: Bool[Tensor, " n"], budget: Int[Tensor, ""] | None) -> Bool[Tensor, " n"]:
         """Gaussians above the threshold, or those with the largest gradients if the budget allows fewer."""
         gradients = torch.where(candidates, self._gradient_sums / self._views.clamp_min(1), -1.0)
         grow = gradients >= self._density.settings.grow_gradient
-        if int(grow.sum()) > budget:
-            strongest = gradients.argsort(descending=True, stable=True)[: max(budget, 0)]
-            grow = torch.zeros_like(grow).index_fill(0, strongest, True)
-        return grow
+        if budget is None:
+            return grow
+        order, places = gradients.argsort(descending=True, stable=True), torch.arange(len(grow), device=grow.device)
+        strongest = torch.zeros_like(grow).scatter_(0, order, places < budget)
+        return torch.where(grow.sum() > budget, strongest, grow)
 
 
 def observe_reference(

@@ -23,7 +23,15 @@ from mien.avatar.density import RefillDensity
 from mien.avatar.settings import Progress
 from mien.avatar.store import GaussianStore
 from mien.gaussians import Rendering
-from mien.training.density_control.strategy import DensityStrategy, Random, Redundant
+from mien.machine.devices import upload
+from mien.training.density_control.strategy import (
+    DensityStrategy,
+    Random,
+    Redundant,
+    count_each,
+    places_in,
+    with_most_visible,
+)
 
 
 class RefillStrategy(DensityStrategy):
@@ -50,17 +58,15 @@ class RefillStrategy(DensityStrategy):
         ]
         if not due:
             return False
-        kept = ~(self._highest_opacities < settings.prune_opacity)
-        if not bool(kept.any()):
-            # Without any Gaussian there is no parent for a refill, so keep the one that was most visible.
-            kept[self._highest_opacities.argmax()] = True
-        store.select(kept)
+        # Without any Gaussian there is no parent for a refill.
+        kept = with_most_visible(~(self._highest_opacities < settings.prune_opacity), self._highest_opacities)
+        store.select(places_in(kept, *count_each(kept)))
         missing = due[-1] - len(store)
         if missing > 0:
             generator = random()
             parents = torch.randint(len(store), (missing,), generator=generator)
-            noise = torch.rand(missing, 3, generator=generator).to(self._highest_opacities) - 0.5
-            parents = parents.to(noise.device)
+            noise = upload(torch.rand(missing, 3, generator=generator), self._highest_opacities) - 0.5
+            parents = upload(parents, noise)
             store.append(parents, self._density.refill(store, parents, noise, progress.fraction))
         self._highest_opacities = torch.zeros(len(store), device=self._highest_opacities.device)
         return True

@@ -191,7 +191,8 @@ class Targets:
         if boxes is None:
             left, top, width, height = cv2.boundingRect(matte)
             boxes = self._boxes[timestep, camera] = (left, top, width, height), *self._tracked(timestep, camera)
-        picture, color = composite(image, matte, background, boxes[0]), torch.from_numpy(background) / 255
+        picture = composite(image, matte, background, boxes[0])
+        color = torch.from_numpy(background.astype(np.float32) / np.float32(255))
         target = Target(torch.from_numpy(picture), torch.from_numpy(matte), boxes[0], color, *boxes[1:])
         return target if self._like.is_cpu else target.pinned()
 

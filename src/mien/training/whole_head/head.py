@@ -123,6 +123,11 @@ class WholeHead:
             begun = meanwhile(side_views.fetched(one.face, one.camera_on_cpu, one.number, random, height))
             self._next_view, self._begun_view = self._begun_view or begun, begun
 
+    @property
+    def has_view(self) -> bool:
+        """Whether the step that runs has a side view."""
+        return self._next_view is not None
+
     def posed(self, posed: Posed, one: BatchFrame) -> Posed:
         """The Gaussians of a frame, of which those that the mesh hides have a colour drawn at random."""
         if self.hideable is None:
