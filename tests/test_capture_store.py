@@ -58,19 +58,11 @@ def test_round_trip_is_exact_and_maps_memory(tmp_path):
         assert torch.equal(camera.K, expected.K)
         assert torch.equal(camera.viewmat, expected.viewmat)
         assert (camera.width, camera.height) == (capture.width, capture.height)
-    points = np.random.default_rng(1).normal(size=(capture.timesteps, 2, 33, 4)).astype(np.float32)
-    points[1] = np.nan
-    hashes.add(write_capture(tmp_path / "body", dataclasses.replace(capture, body=points)))
-    np.testing.assert_array_equal(read_capture(tmp_path / "body").body, points)
-    assert read.body is None
-    points[0, 1, 32, 3] = 1e30
-    write_capture(tmp_path / "impossible", dataclasses.replace(capture, body=points))
-    refuses("impossible points of a body", read_capture, tmp_path / "impossible")
     for field in ("images", "mattes", "landmarks", "timestamps"):
         changed = getattr(capture, field).copy()
         changed.flat[0] += 1
         hashes.add(write_capture(tmp_path / field, dataclasses.replace(capture, **{field: changed})))
-    assert len(hashes) == 7
+    assert len(hashes) == 6
 
 
 def flip(path, place=7):

@@ -64,16 +64,6 @@ def axis_angle_from_quaternion(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*
     return imaginary * factor[..., None]
 
 
-def quaternion_from_axis_angle(axis_angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """Unit wxyz quaternions of axis-angle vectors in radians; smooth at zero."""
-    squared = (axis_angle * axis_angle).sum(-1, keepdim=True)
-    small = squared < _SMALL_ANGLE_SQUARED
-    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
-    sine = torch.where(small, 0.5 - squared / 48, (0.5 * angle).sin() / angle)
-    real = torch.where(small, 1 - squared / 8, (0.5 * angle).cos())
-    return torch.cat([real, sine * axis_angle], dim=-1)
-
-
 def matrix_from_quaternion(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation matrices of wxyz quaternions, which are normalised first."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)

@@ -26,7 +26,6 @@ from mien.face.listing import available_face_models
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import head_poses
-from mien.face.torso import plain_model
 from mien.gaussians import Gaussians
 from mien.runtime import baked
 from mien.runtime.baked import About, BakedAvatar, Filmed, Neutral, PortableAvatar, Rig
@@ -41,17 +40,15 @@ def as_log_scales(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 @torch.no_grad()
 def bake_rig(face_model: FaceModel, subject: FaceParams) -> Rig:
-    """A face model's vertices with one subject's identity and offsets applied, in terms of its `plain_model`."""
-    vertices, joints = face_model.rest_vertices(subject), face_model.rest_joints(subject)
-    face_model = plain_model(face_model)
+    """A face model's vertices with one subject's identity and offsets applied."""
     return Rig(
-        template=as_array(vertices),
+        template=as_array(face_model.rest_vertices(subject)),
         expression_names=face_model.expression_names,
         expression_basis=as_array(face_model.expression_basis),
         joint_names=face_model.joint_names,
         joint_parents=face_model.joint_parents,
         joint_free=face_model.joint_free,
-        joint_template=as_array(joints),
+        joint_template=as_array(face_model.rest_joints(subject)),
         joint_rotation_basis=as_array(face_model.joint_rotation_basis),
         joint_translation_basis=as_array(face_model.joint_translation_basis),
         skinning_weights=as_array(face_model.skinning_weights),

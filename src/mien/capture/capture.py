@@ -36,9 +36,6 @@ class Capture:
     """One calibrated camera per camera_id, in one world frame, for frames of this size. None if unknown."""
     quality: FrameQuality | None = None
     """Sharpness and lighting of the face. None if they were not measured."""
-    body: Float[np.ndarray, "t c 33 4"] | None = None
-    """Points of the body (`mien.capture.person.body`): x, y and z in pixels, and visibility. NaN where none was found,
-    None if nobody looked."""
 
     @property
     def usable(self) -> Bool[np.ndarray, "t c"]:

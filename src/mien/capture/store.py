@@ -12,7 +12,6 @@ from mien.camera import Camera
 from mien.capture import frame_files
 from mien.capture.cameras.calibration import is_file_name
 from mien.capture.capture import Capture
-from mien.capture.person.body import BODY_POINTS
 from mien.capture.person.faces import LANDMARKS
 from mien.capture.quality import FrameQuality
 from mien.disk.files import cannot_write, read_arrays, read_json, replace_folder, write_arrays, write_json
@@ -35,12 +34,10 @@ _ARRAYS = {
     "frame_digests": ("tc", np.uint64),
     "matte_digests": ("tc", np.uint64),
     **dict.fromkeys(_QUALITY, ("tc", np.float32)),
-    "body": ("tcb4", np.float32),
     "K": ("c33", np.float64),
     "viewmat": ("c44", np.float64),
 }
-"""Axes and type of every array in the safetensors file. `body` is there if it was looked for, the last two if the
-cameras are calibrated."""
+"""Axes and type of every array in the safetensors file. The last two are there if the cameras are calibrated."""
 _MAX_SECONDS = 1e7  # longest time from the first frame to the last, in seconds
 
 
@@ -96,7 +93,6 @@ def _read_capture(path: Path) -> Capture:
         name=content["name"], camera_ids=camera_ids, fps=fps, timestamps=arrays["timestamps"], images=images,
         mattes=mattes, landmarks=arrays["landmarks"], valid=arrays["valid"], principal_point=arrays["principal_point"],
         source=content["source"], calibration=calibration, quality=quality,
-        body=arrays.get("body"),
     )  # fmt: skip
 
 
@@ -161,8 +157,6 @@ def _arrays(capture: Capture, digests: dict[str, np.ndarray]) -> dict[str, np.nd
     if capture.calibration is not None:
         arrays["K"] = np.stack([camera.K.numpy() for camera in capture.calibration])
         arrays["viewmat"] = np.stack([camera.viewmat.numpy() for camera in capture.calibration])
-    if capture.body is not None:
-        arrays["body"] = capture.body
     if capture.quality is not None:
         arrays |= vars(capture.quality)
     return {name: array.astype(_ARRAYS[name][1]) for name, array in arrays.items()}
@@ -184,7 +178,7 @@ def _check(content: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     if not (1e-3 <= content["fps"] <= 1e5 and is_one_line(content["name"]) and isinstance(content["source"], dict)):
         raise ValueError("frame rate, name or source that no capture has")
     timesteps = checked_whole(content["timesteps"], 1, 1 << 40)
-    sizes = {"t": timesteps, "c": len(ids), "l": LANDMARKS, "b": BODY_POINTS, "2": 2, "3": 3, "4": 4}
+    sizes = {"t": timesteps, "c": len(ids), "l": LANDMARKS, "2": 2, "3": 3, "4": 4}
     for name, array in arrays.items():
         axes, dtype = _ARRAYS[name]
         expected = tuple(sizes[axis] for axis in axes)
@@ -195,9 +189,6 @@ def _check(content: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     numbers = (times, arrays["principal_point"], landmarks[valid], landmarks[~np.isnan(landmarks)])
     if not all(map(is_moderate, numbers)) or (np.diff(times) < 0).any() or np.ptp(times) > _MAX_SECONDS:
         raise ValueError("impossible times, landmarks or principal points")
-    body = arrays.get("body", landmarks[:0])
-    if not is_moderate(body[~np.isnan(body)]):
-        raise ValueError("impossible points of a body")
     if any(np.isinf(arrays[name]).any() for name in _QUALITY if name in arrays):
         raise ValueError("impossible figures of quality")
 

@@ -16,10 +16,9 @@ AXES = {
     "expression_basis": "ev3", "expression_bounds": "e2", "joint_template": "k3", "joint_identity_basis": "ik3",
     "joint_rotation_basis": "ek3", "joint_translation_basis": "ek3", "skinning_weights": "vk", "pose_basis": "pv3",
     "expression_sigmas": "e", "joint_regressor": "kv", "flame_origin": "3",
-    "torso_shares": "k",
 }  # fmt: skip
 """Axes of the tensors of `FaceModel`."""
-_OPTIONAL = ("pose_basis", "expression_sigmas", "joint_regressor", "flame_origin", "torso_shares")
+_OPTIONAL = ("pose_basis", "expression_sigmas", "joint_regressor", "flame_origin")
 _INDICES = {"faces": "v", "uv_faces": "u", "face_regions": "r"}
 """Axis into which the values of each of these tensors are indices."""
 
@@ -42,10 +41,8 @@ def check_face_params(model: FaceModel, face: FaceParams, where: str, remedy: st
     shapes = {
         "identity": (len(model.identity_basis),), "expression": (b, len(model.expression_basis)),
         "joints": (b, len(model.free_joint_names), 3), "head_rotation": (b, 3), "head_translation": (b, 3),
-        "vertex_offsets": (v, 3), "torso_rotation": (b, 3), "torso_translation": (b, 3),
+        "vertex_offsets": (v, 3),
     }  # fmt: skip
-    if (face.torso_rotation is None) != (face.torso_translation is None):
-        raise UserError(f"{where}: has a rotation or a translation of the torso without the other; {remedy}")
     for name, tensor in face.tensors().items():
         if tuple(tensor.shape) != shapes[name]:
             fault = f"{name} is {list(tensor.shape)}, but the face model {model.name!r} has {list(shapes[name])}"

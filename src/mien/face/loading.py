@@ -74,6 +74,11 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
         return model
 
 
+def head_only(model: FaceModel) -> FaceModel:
+    """Return the head-only model whose head a model with a torso has."""
+    return load_face_model(model.name.replace(_BUST, _BASE))
+
+
 def bake_bust() -> FaceModel:
     """Build the bust on the head-only model of the cache."""
     return named("mien.face.models.anny_bust:bake_anny_bust")(load_face_model_without_landmarks(_BASE))

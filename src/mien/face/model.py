@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mien.face.params import FaceParams
 from mien.face.posing import has_native_posing, pose_vertices
-from mien.face.torso import torso_motion
 from mien.rotation import matrix_from_axis_angle, rigid_transform
 
 JOINTS = ("head", "neck", "jaw", "left_eye", "right_eye")
@@ -42,9 +41,9 @@ class FaceModel:
 
     All lengths are in metres, in the head frame: +x to the subject's left, +y up, +z ahead, origin about between the
     ears. Joint 0 is `head`. It is at the origin, and its motion is the head pose itself (`FaceParams.T_world_head`).
-    Other joints move relative to their parent. A joint's motion is either free (a row of `FaceParams.joints`), or
-    derived from the expression, or a share of the torso's. A derived joint (such as a jaw that follows `jawOpen`)
-    turns by `joint_rotation_basis` and shifts by `joint_translation_basis`, both linear in the expression.
+    Other joints move relative to their parent. A joint's motion is either free (a row of `FaceParams.joints`) or
+    derived from the expression, never both. A derived joint (such as a jaw that follows `jawOpen`) turns by
+    `joint_rotation_basis` and shifts by `joint_translation_basis`, both linear in the expression.
     """
 
     name: str
@@ -91,9 +90,6 @@ class FaceModel:
     vertices (FLAME's). If None, offsets do not move joints."""
     flame_origin: Float[Tensor, " 3"] | None = None
     """Origin of the head frame in FLAME's coordinates, in metres. None for models that are not in FLAME's schema."""
-    torso_shares: Float[Tensor, " k"] | None = None
-    """Share of the torso's motion relative to the head that each joint has: 1 for `torso`, 0.5 for the neck between
-    them. None for models that end at the neck. Joints with a share are not free; they are all about one point."""
 
     @cached_property
     def content_hash(self) -> str:
@@ -105,7 +101,6 @@ class FaceModel:
         geometry = (
             "template", "faces", "identity_basis", "expression_basis", "joint_template", "joint_identity_basis",
             "joint_rotation_basis", "joint_translation_basis", "skinning_weights", "pose_basis", "joint_regressor",
-            "torso_shares",
         )  # fmt: skip
         for name in geometry:
             tensor = getattr(self, name)
@@ -124,20 +119,6 @@ class FaceModel:
     def free_joint_names(self) -> tuple[str, ...]:
         """Names of the rows of `FaceParams.joints`."""
         return tuple(name for name, free in zip(self.joint_names, self.joint_free, strict=True) if free)
-
-    @cached_property
-    def torso_share_numbers(self) -> tuple[float, ...]:
-        """`torso_shares` as numbers, so that no step waits for a GPU; 0 without a torso."""
-        return (0.0,) * len(self.joint_names) if self.torso_shares is None else tuple(self.torso_shares.tolist())
-
-    @cached_property
-    def build_directions(self) -> slice:
-        """Which identity directions move no part of the head: the last ones of a model with a torso, else none."""
-        count = len(self.identity_basis)
-        if self.torso_shares is None:
-            return slice(count, count)
-        moves_head = self.identity_basis[:, self.skinning_weights[:, 0] == 1].flatten(1).any(1)
-        return slice(int(moves_head.nonzero().max()) + 1, count)
 
     def neutral(self, timesteps: int = 1) -> FaceParams:
         """Return parameters of the mean person at rest at the world's origin."""
@@ -208,10 +189,6 @@ class FaceModel:
         rest = self.rest_joints(face)
         rotation = torch.einsum("be,ekc->bkc", face.expression, self.joint_rotation_basis)
         shift = torch.einsum("be,ekc->bkc", face.expression, self.joint_translation_basis)
-        if self.torso_shares is not None:
-            torso = torso_motion(self, face)
-            rotation = rotation + self.torso_shares[:, None] * torso.rotation[:, None]
-            shift = shift + self.torso_shares[:, None] * torso.shift[:, None]
         # Stack joint by joint: an index tensor would be copied to the GPU in every training step.
         given = iter(face.joints.unbind(1))
         turns = [next(given) if free else rotation[:, index] for index, free in enumerate(self.joint_free)]

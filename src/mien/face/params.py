@@ -27,13 +27,6 @@ class FaceParams:
     """Origin of the head frame in world space, in metres."""
     vertex_offsets: Float[Tensor, "v 3"] | None = None
     """Static offsets of this subject's vertices in the head frame, in metres."""
-    torso_rotation: Float[Tensor, "b 3"] | None = None
-    """Axis-angle of the torso frame, parallel to the head frame at rest, in world space, in radians.
-
-    None, with `torso_translation`: the torso moves with the head, at rest. Models without a joint `torso` ignore both.
-    """
-    torso_translation: Float[Tensor, "b 3"] | None = None
-    """Origin of the torso frame (`mien.face.torso.torso_origin`) in world space, in metres."""
 
     def __len__(self) -> int:
         return self.expression.shape[0]
@@ -42,11 +35,13 @@ class FaceParams:
         """Return some timesteps. The batch axis is kept, also for a single timestep."""
         if isinstance(index, int):
             index = slice(index, index + 1) if index != -1 else slice(-1, None)
-        return replace(self, **{name: tensor[index] for name, tensor in self.tensors().items() if name in _BY_TIMESTEP})
-
-    def with_torso(self, rotation: Float[Tensor, "b 3"], translation: Float[Tensor, "b 3"]) -> "FaceParams":
-        """Return the same faces on other torsos."""
-        return replace(self, torso_rotation=rotation, torso_translation=translation)
+        return replace(
+            self,
+            expression=self.expression[index],
+            joints=self.joints[index],
+            head_rotation=self.head_rotation[index],
+            head_translation=self.head_translation[index],
+        )
 
     @property
     def T_world_head(self) -> Float[Tensor, "b 4 4"]:
@@ -66,9 +61,6 @@ class FaceParams:
         return FaceParams(**{name: tensor.detach() for name, tensor in self.tensors().items()})
 
 
-_BY_TIMESTEP = ("expression", "joints", "head_rotation", "head_translation", "torso_rotation", "torso_translation")
-
-
 def most_frontal_camera(cameras: Sequence[Camera], face: FaceParams) -> int:
     """The index of the camera that the face looks at most directly, as the median over the timesteps of `face`."""
     ahead, origins = face.T_world_head[:, :3, 2], face.head_translation
@@ -80,6 +72,10 @@ def most_frontal_camera(cameras: Sequence[Camera], face: FaceParams) -> int:
 
 def concatenate(parts: Sequence[FaceParams]) -> FaceParams:
     """Concatenate the timesteps of all parts. Identity and offsets are the first part's."""
-    first = parts[0]
-    names = [name for name in first.tensors() if name in _BY_TIMESTEP]
-    return replace(first, **{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+    return replace(
+        parts[0],
+        expression=torch.cat([p.expression for p in parts]),
+        joints=torch.cat([p.joints for p in parts]),
+        head_rotation=torch.cat([p.head_rotation for p in parts]),
+        head_translation=torch.cat([p.head_translation for p in parts]),
+    )

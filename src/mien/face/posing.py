@@ -12,7 +12,6 @@ from torch.autograd.function import once_differentiable
 from mien import _native
 from mien.arrays import is_native, unpacked
 from mien.face.params import FaceParams
-from mien.face.torso import plain_model, plain_motion
 from mien.kernels import on_gpu
 
 if TYPE_CHECKING:
@@ -24,9 +23,7 @@ _MAX_SHAPES = 256  # largest number of expressions plus nine per free joint: kMo
 
 def has_native_posing(model: "FaceModel", face: FaceParams) -> bool:
     """Whether `pose_vertices` supports this model and these parameters."""
-    carried = sum(share > 0 for share in model.torso_share_numbers)
-    shifts = 3 if carried else 0
-    if model.expression_basis.shape[0] + shifts + 9 * (len(model.free_joint_names) + carried) > _MAX_SHAPES:
+    if model.expression_basis.shape[0] + 9 * len(model.free_joint_names) > _MAX_SHAPES:
         return False
     return is_native(model.template, *face.tensors().values())
 
@@ -36,7 +33,7 @@ def pose_vertices(model: "FaceModel", face: FaceParams, in_world: bool) -> Float
     compiled = compiled_model(model)
     rest, joint_rest = compiled.rest.of(model, face)
     head = (face.head_rotation, face.head_translation) if in_world else (None, None)
-    return _PoseVertices.apply(compiled.data, rest, joint_rest, *plain_motion(model, face), *head)
+    return _PoseVertices.apply(compiled.data, rest, joint_rest, face.expression, face.joints, *head)
 
 
 def head_poses(face: FaceParams) -> Float[Tensor, "b 4 4"]:
@@ -74,7 +71,6 @@ class CompiledModel:
     """A model's constants in the core's layout, and the last person's shape."""
 
     def __init__(self, model: "FaceModel"):
-        model = plain_model(model)
         pose_basis = model.pose_basis
         self.data = _native.make_face_model(
             model.expression_basis.contiguous(),

@@ -15,7 +15,6 @@ from torch.autograd.function import once_differentiable
 
 from mien.face.params import FaceParams
 from mien.face.posing import RestShape
-from mien.face.torso import plain_model, plain_motion
 from mien.kernels import blocks, launch
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def pose_face(model: "FaceModel", face: FaceParams, in_world: bool) -> tuple[Ten
     rest, joints = constants.rest.of(model, face)
     if rest.requires_grad or joints.requires_grad:
         return None
-    motion = (*plain_motion(model, face), face.head_rotation, face.head_translation)
+    motion = (face.expression, face.joints, face.head_rotation, face.head_translation)
     return _Pose.apply(constants, in_world, rest, joints, *motion)  # pyright: ignore[reportReturnType]
 
 
@@ -80,7 +79,7 @@ class _Constants:
     """A face model as the kernels take it."""
 
     def __init__(self, model: "FaceModel"):
-        self.rest, model = RestShape(), plain_model(model)
+        self.rest = RestShape()
         bases = [model.expression_basis] if model.pose_basis is None else [model.expression_basis, model.pose_basis]
         self.basis = torch.cat(bases).flatten(1).contiguous()
         self.weights = model.skinning_weights.contiguous()

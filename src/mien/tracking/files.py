@@ -19,16 +19,15 @@ _FORMAT, _VERSION = "mien.tracking", 1
 _JSON, _TENSORS = "tracking.json", "tracking.safetensors"
 _STAGE = "`mien track`"
 _REMEDY = "delete the folder and run `mien track` again"
-_TORSO = ("torso_rotation", "torso_translation")
-_FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets", *_TORSO)
+_FACE = ("identity", "expression", "joints", "head_rotation", "head_translation", "vertex_offsets")
 _APPEARANCE = ("texture", "trust", "light")
-_OPTIONAL = (*_TORSO, "vertex_offsets", "pixel_residuals", "covered", *_APPEARANCE)
+_OPTIONAL = ("vertex_offsets", "pixel_residuals", "covered", *_APPEARANCE)
 _FLAGS = ("valid", "covered")
 _AXES = {
     "identity": "i", "expression": "te", "joints": "tj3", "head_rotation": "t3", "head_translation": "t3",
     "vertex_offsets": "v3", "valid": "t", "neck_lines": "tc3", "residuals": "tc", "camera_K": "c33",
     "camera_viewmats": "c44", "pixel_residuals": "tc", "texture": "yx3", "trust": "yx", "light": "93",
-    "covered": "tcp", "torso_rotation": "t3", "torso_translation": "t3",
+    "covered": "tcp",
 }  # fmt: skip
 """Axes of each tensor. Axes of the same letter have the same size."""
 
@@ -143,6 +142,4 @@ def _fault_of(tensors: dict[str, Tensor]) -> str:
             absent = tensor.isnan() & ((tensors["valid"][:, None] == 0) | tensor.isfinite().any(1, keepdim=True))
         if not (absent | (tensor.abs() <= MAX_NUMBER)).all():
             return f"{name!r} holds numbers that are not finite, or beyond {MAX_NUMBER:g}"
-    if len(tensors.keys() & set(_TORSO)) == 1:
-        return f"has one of {_TORSO} without the other"
     return ""

@@ -16,12 +16,13 @@ from mien.avatar.ops.triangle_frames import bind_to_world, rig_topology
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.posing import compiled_model, has_native_posing, head_poses
-from mien.face.torso import plain_motion
 from mien.gaussians import Gaussians
 from mien.kernels import on_gpu
 
 LOCAL = ("means", "quats", "log_scales", "opacity_logits")
 """Names of the tensors of Gaussians in the frames of their triangles."""
+FACE_FIELDS = ("expression", "joints", "head_rotation", "head_translation")
+"""Names of the parameters of a face that change from timestep to timestep."""
 
 
 def pose_bound_gaussians(
@@ -70,7 +71,7 @@ def prepare_posing(
     if rest[0].requires_grad:
         return None
     topology = rig_topology(len(face_model.template), face_model.faces, store["face_index"])
-    pose = (*plain_motion(face_model, face), face.head_rotation, face.head_translation)
+    pose = (getattr(face, name) for name in FACE_FIELDS)
     return compiled.data, topology, [*rest, *pose, *(store[name] for name in LOCAL)]
 
 

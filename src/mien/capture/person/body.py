@@ -1,9 +1,8 @@
 """Find a person's body in pictures: the 33 points of MediaPipe's pose network. Its shoulders place a torso."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32, UInt8
 
 from mien.capture.person.backend import Networks, load_solution, quiet_mediapipe
 
@@ -36,12 +35,6 @@ class BodyReader(Networks):
             return np.array(points, np.float32) * np.array([width, height, width, 1], np.float32)
 
         return read
-
-
-def find_bodies(images: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Float32[np.ndarray, "t 33 4"]:
-    """Return the points of the body in each picture of a clip (`BodyReader.read`)."""
-    with BodyReader() as reader:
-        return np.stack([reader.read(np.ascontiguousarray(image)) for image in images])
 
 
 def _none() -> np.ndarray:

@@ -32,6 +32,7 @@ from mien.face.models.anny_source import (
 )
 from mien.face.models.anny_topology import BUST_REGIONS, HeadTopology, cut_bust, cut_head
 from mien.face.models.schema import rounded
+from mien.face.torso import NECK_SHARE, TORSO, TORSO_SHIFTS
 from mien.machine.progress import progress_bar
 from mien.rotation import matrix_from_axis_angle
 
@@ -231,7 +232,8 @@ def _assemble(
         weights[~skull, joint] = np.maximum(values[~skull], 0)
     joints = np.pad(head.joint_identity_basis.numpy(), ((0, BUILD), (0, 0), (0, 0)))
     bases = head.joint_rotation_basis, head.joint_translation_basis
-    rotations, translations = (torch.nn.functional.pad(basis, (0, 0, 0, 1)) for basis in bases)
+    rotations, translations = (torch.nn.functional.pad(basis, (0, 0, 0, 1, 0, 3)) for basis in bases)
+    translations[-3:, neck], translations[-3:, -1] = NECK_SHARE * torch.eye(3), torch.eye(3)
     # The neck's and the torso's motion are about the same point, the pivot of the head-only model's neck.
     about = [*range(len(head.joint_names)), neck]
     assert head.pose_basis is not None
@@ -245,17 +247,17 @@ def _assemble(
         region_names=BUST_REGIONS,
         face_regions=torch.from_numpy(topology.face_regions),
         identity_basis=joined(directions, identity),
-        expression_basis=joined(head.expression_basis, deltas),
-        joint_names=(*head.joint_names, "torso"),
+        expression_basis=torch.cat([joined(head.expression_basis, deltas), torch.zeros(3, v, 3)]),
+        expression_names=(*head.expression_names, *TORSO_SHIFTS),
+        expression_bounds=torch.cat([head.expression_bounds, torch.zeros(3, 2)]),
+        joint_names=(*head.joint_names, TORSO),
         joint_parents=(*head.joint_parents, 0),
-        joint_free=(*(free and joint != neck for joint, free in enumerate(head.joint_free)), False),
+        joint_free=(*head.joint_free, True),
         joint_template=head.joint_template[about],
         joint_identity_basis=torch.from_numpy(joints)[:, about].contiguous(),
         joint_rotation_basis=rotations,
         joint_translation_basis=translations,
         skinning_weights=rounded(weights, QUANTUM),
-        # The lids follow the eyes; the correctives of the neck, which come first, are empty.
-        pose_basis=torch.nn.functional.pad(head.pose_basis[9:], (0, 0, 0, v - h)),
-        torso_shares=torch.tensor([{neck: 0.5, len(about) - 1: 1.0}.get(joint, 0.0) for joint in range(len(about))]),
+        pose_basis=torch.nn.functional.pad(head.pose_basis, (0, 0, 0, v - h, 0, 9)),
         landmarks={},
     )

@@ -14,12 +14,13 @@ from torch import Tensor
 from mien.camera import Camera
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.face.torso import resting_torso, torso_motion, torso_origin
+from mien.face.torso import TorsoPose, build_directions, motion_of, torso_origin, with_torso
 from mien.rotation import matrix_from_axis_angle
 
 SHOULDERS = (11, 12)
 """Points of the pose network: the left and the right shoulder of the person."""
 _ITERATIONS = 300
+_START_TURN = 0.3  # share of the head's turn with which the descent begins
 
 
 @dataclass(frozen=True)
@@ -50,28 +51,30 @@ def fit_torso(
     camera: Camera,
     points: Float[Tensor, "b 33 4"],
     timestamps: Float[Tensor, " b"],
+    known_build: Float[Tensor, " n"] | None = None,
     priors: TorsoPriors = TorsoPriors(),
 ) -> FaceParams:
     """Return the same faces with a torso and a build that fit the points (x and y in pixels, z, visibility).
 
-    Frames without points have NaN. z is not used: the network guesses turns of 40 degrees that are not there. The build
-    is what the identity has beyond the directions of the head, which stay as they are.
+    The world is one in which a head that faces the camera has a rotation of about zero. Frames without points have NaN.
+    z is not used: the network guesses turns of 40 degrees that are not there. The build is what the identity has beyond
+    the directions of the head, which stay as they are. A known build stays, too.
     """
     like = torch.zeros((), dtype=torch.float64)
     model, face, camera = model.to(like), face.to(like), camera.to(like)
     seen, times = points[:, SHOULDERS].to(like), timestamps.to(like)
-    start = resting_torso(model, face)
-    assert start.torso_rotation is not None
-    assert start.torso_translation is not None
+    build = build_directions(model)
+    upright = matrix_from_axis_angle(face.head_rotation)
+    at_rest = face.head_translation + (upright @ torso_origin(model, face)[:, None])[:, :, 0]
     # Every unknown counts in its prior's unit, so that the descent sees a round valley.
     starts = (
-        0.3 * start.torso_rotation,
-        start.torso_translation,
-        face.identity[model.build_directions],
+        _START_TURN * face.head_rotation,
+        at_rest,
+        face.identity[build] if known_build is None else known_build.to(like),
         like.new_zeros(3),
         face.head_rotation.mean(0),
     )
-    scales = priors.still, priors.shift, 1.0, priors.response, priors.facing
+    scales = priors.still, priors.shift, 1.0 if known_build is None else 0.0, priors.response, priors.facing
     unknown = [torch.zeros_like(value).requires_grad_() for value in starts]
     optimizer = torch.optim.LBFGS(unknown, max_iter=_ITERATIONS, history_size=30, line_search_fn="strong_wolfe")
     cost = _cost_of(model, face, camera, (seen, times), priors)
@@ -85,14 +88,11 @@ def fit_torso(
         value.backward()
         return value
 
-    optimizer.step(closure)  # pyright: ignore[reportArgumentType]
+    with torch.enable_grad():
+        optimizer.step(closure)  # pyright: ignore[reportArgumentType]
     turn, place, own, *_ = (value.detach() for value in values())
-    return _with(face, model.build_directions, turn, place, own).to(torch.zeros(()))
-
-
-def _with(face: FaceParams, build: slice, turn: Tensor, place: Tensor, own: Tensor) -> FaceParams:
-    identity = torch.cat([face.identity[: build.start], own])
-    return replace(face, identity=identity).with_torso(turn, place)
+    face = replace(face, identity=torch.cat([face.identity[: build.start], own]))
+    return with_torso(model, face, TorsoPose(turn, place)).to(torch.zeros(()))
 
 
 def _cost_of(
@@ -105,7 +105,7 @@ def _cost_of(
     width = (there[:, 0] - there[:, 1]).norm(dim=1)[visible.amin(1) > 0.5].median()
     steps = 0.5 * (times[2:] - times[:-2])
     mirror = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]).to(times)
-    shoulders, build = model.landmarks["shoulders"], model.build_directions
+    shoulders, build = model.landmarks["shoulders"], build_directions(model)
     origin = torso_origin(model, face)  # No build moves it.
     ahead = face.head_rotation.mean(0)
 
@@ -125,8 +125,10 @@ def _cost_of(
         off = (camera.project(world)[0] - there) / (priors.pixels * width)
         # Cauchy: a shoulder that is far off is a wrong one.
         total = (visible * torch.log1p((off * off).sum(-1))).sum()
-        motion = torso_motion(model, face.with_torso(turn, place))
-        total = total + (motion.shift / priors.shift).square().sum() + (motion.rotation / priors.turn).square().sum()
+        relative, shift = motion_of(TorsoPose(turn, place), face, origin)
+        # Twice the sine of half the angle: it is smooth where an angle is not.
+        turned = 0.5 * (relative - torch.eye(3).to(relative)).square().sum()
+        total = total + (shift / priors.shift).square().sum() + turned / priors.turn**2
         total = total + ((turn - most) / priors.still).square().sum() + ((most - ahead) / priors.facing).square().sum()
         for path, sigma in ((place, priors.acceleration), (turn, priors.angular_acceleration)):
             bend = (path[2:] - 2 * path[1:-1] + path[:-2]) / steps[:, None] ** 2
