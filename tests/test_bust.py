@@ -6,13 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from known import known
 from mien.camera import Camera
-from mien.errors import UserError
 from mien.face import FaceModel, FaceParams, load_face_model
-from mien.face.checks import check_face_params
-from mien.face.params import concatenate
-from mien.face.torso import plain_face, plain_model, resting_torso, still_torso, torso_motion, torso_of_neck
+from mien.face.torso import TorsoPose, build_directions, still_torso, torso_pose, with_torso
 from mien.rotation import matrix_from_axis_angle
 from mien.tracking.landmarks.torso import SHOULDERS, fit_torso
 from mien.tracking.neck_line import bottom_vertices
@@ -56,15 +52,16 @@ def test_its_head_is_that_of_the_head_only_model_to_the_bit(head_only, bust):
     assert bust.region_names[: len(head_only.region_names)] == head_only.region_names
     assert torch.equal(bust.template[same], head_only.template[same])
     assert torch.equal(bust.identity_basis[: len(head_only.identity_basis), same], head_only.identity_basis[:, same])
-    assert torch.equal(bust.expression_basis[:, :h], head_only.expression_basis)
+    assert torch.equal(bust.expression_basis[:-3, :h], head_only.expression_basis)
     assert bust.landmarks.keys() >= {"mediapipe", "ibug68"}
     for name in ("mediapipe", "ibug68"):
         places = (one.landmark_positions(one.template, name) for one in (bust, head_only))
         assert torch.equal(*places)
-    # The same coefficients pose the same head. The neck's are the torso's now.
+    # The same coefficients pose the same head.
     face = turned(bust)
-    joints = torch.cat([torch.zeros(len(face), 1, 3), face.joints], dim=1)
-    theirs = replace(face, identity=face.identity[: len(head_only.identity_basis)], joints=joints)
+    count, shapes = len(head_only.identity_basis), len(head_only.expression_names)
+    motion = {"expression": face.expression[:, :shapes], "joints": face.joints[:, :-1]}
+    theirs = replace(face, identity=face.identity[:count], **motion)
     torch.testing.assert_close(bust(face)[:, same], head_only(theirs)[:, same], atol=2e-6, rtol=0)
 
 
@@ -101,23 +98,27 @@ def test_the_torso_stands_still_while_the_head_moves_and_moves_with_it_by_defaul
     below = bust.faces[bust.region_mask("bust")].unique()
     assert torch.isin(below, ours).float().mean() > 0.9
     assert bust.skinning_weights[below, bust.joint_names.index("torso")].min() > 0.5
-    still = bust(still_torso(bust, face))
+    on_still = still_torso(bust, face, face[0])
+    still = bust(on_still)
     torch.testing.assert_close(still[:, ours], still[:1, ours].expand(len(face), -1, -1), atol=2e-6, rtol=0)
     moving = bust(face)
-    assert torch.equal(still[:, theirs], moving[:, theirs])
+    torch.testing.assert_close(still[:, theirs], moving[:, theirs], atol=2e-6, rtol=0)
     assert (moving[1:, ours] - moving[:1, ours]).norm(dim=2).mean() > 0.02
-    assert torch.allclose(bust(resting_torso(bust, face)), moving, atol=2e-6)
     # A pose of its own moves it rigidly, whatever the head does.
-    own = still_torso(bust, face)
-    own_rotation, own_translation = known(own.torso_rotation), known(own.torso_translation)
-    rotation = own_rotation.roll(1, 0) + 0.2 * POSES[:1]
-    moved = bust(own.with_torso(rotation, own_translation + 0.01))[:, ours]
-    R, origin = matrix_from_axis_angle(rotation), own_translation[0]
-    torch.testing.assert_close(moved, (still[0, ours] - origin) @ R.mT + origin + 0.01, atol=2e-6, rtol=0)
+    own = torso_pose(bust, on_still)
+    rotation = own.rotation + 0.2 * torch.cat([POSES[:1], POSES])
+    posed = with_torso(bust, face, TorsoPose(rotation, own.translation + 0.01))
+    R, origin = matrix_from_axis_angle(rotation), own.translation[0]
+    to_rest = matrix_from_axis_angle(own.rotation[0])
+    expected = (still[0, ours] - origin) @ to_rest @ R.mT + origin + 0.01
+    torch.testing.assert_close(bust(posed)[:, ours], expected, atol=4e-6, rtol=0)
+    for found, given in zip(torso_pose(bust, posed), (rotation, own.translation + 0.01), strict=True):
+        torch.testing.assert_close(found, given, atol=2e-6, rtol=0)
 
 
 def test_the_neck_between_them_neither_tears_nor_shrinks(bust):
-    face = still_torso(bust, replace(turned(bust), head_translation=torch.zeros(1 + len(POSES), 3)))
+    face = replace(turned(bust), head_translation=torch.zeros(1 + len(POSES), 3))
+    face = still_torso(bust, face, face[0])
     edges = torch.cat([bust.faces[:, [0, 1]], bust.faces[:, [1, 2]], bust.faces[:, [2, 0]]])
     bent = bust.skinning_weights[:, [0, bust.joint_names.index("torso")]].amax(1) < 1
     edges = edges[bent[edges].any(1)]
@@ -129,22 +130,11 @@ def test_the_neck_between_them_neither_tears_nor_shrinks(bust):
     # Twisted by 60 degrees, the middle of the neck keeps its girth: half of the turn is the neck joint's.
     twisted = bust.neutral(2)
     twisted.head_rotation[1, 1] = torch.pi / 3
-    posed = bust(still_torso(bust, twisted))
+    posed = bust(still_torso(bust, twisted, twisted[0]))
     middle = bust.skinning_weights[:, bust.joint_names.index("neck")] > 0.6
     axis = bust.joint_template[bust.joint_names.index("torso"), [0, 2]]
     first, then = ((one[middle][:, [0, 2]] - axis).norm(dim=1).mean() for one in posed)
     assert then / first > 0.97
-
-
-def test_the_neck_joint_of_the_head_only_model_is_a_torso(head_only, bust):
-    face, neck = turned(bust), 0.3 * torch.randn(1 + len(POSES), 3, generator=torch.Generator().manual_seed(4))
-    joints = torch.cat([neck[:, None], face.joints], dim=1)
-    theirs = replace(face, identity=face.identity[: len(head_only.identity_basis)], joints=joints)
-    expected = head_only.joint_transforms(theirs)[:, head_only.joint_names.index("neck")]
-    ours = torso_of_neck(bust, face, neck)
-    found = bust.joint_transforms(ours)[:, bust.joint_names.index("torso")]
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
-    assert torso_motion(bust, ours).shift.abs().max() < 1e-6
 
 
 def test_build_sets_shoulders_and_neck_and_moves_no_head(head_only, bust):
@@ -165,26 +155,6 @@ def test_build_sets_shoulders_and_neck_and_moves_no_head(head_only, bust):
     assert coefficients.abs().max() < 3.0, "each can be set by itself, within what people have"
 
 
-def test_engines_that_know_no_torso_pose_it_by_free_joints_and_coefficients(bust):
-    face = still_torso(bust, turned(bust))
-    plain, plainly = plain_model(bust), plain_face(bust, face)
-    assert plain.torso_shares is None
-    assert plain.free_joint_names == ("neck", "left_eye", "right_eye", "torso")
-    for pose in ("__call__", "head_vertices", "vertices_reference"):
-        torch.testing.assert_close(getattr(plain, pose)(plainly), getattr(bust, pose)(face), atol=2e-6, rtol=0)
-    assert plain_model(plain) is plain
-
-
-def test_parameters_keep_the_torso_when_they_are_cut_and_joined(bust):
-    face = still_torso(bust, turned(bust))
-    again = concatenate([face[:2], face[2], face[[3, 4]]])
-    for name, tensor in face.tensors().items():
-        assert torch.equal(again.tensors()[name], tensor)
-    assert turned(bust)[0].torso_rotation is None
-    with pytest.raises(UserError, match="without the other"):
-        check_face_params(bust, replace(face, torso_rotation=None), "FILE", "track again")
-
-
 def test_the_base_of_the_neck_is_where_it_is_without_a_bust(head_only, bust):
     assert torch.equal(bottom_vertices(bust), bottom_vertices(head_only))
 
@@ -194,12 +164,12 @@ def test_a_torso_is_found_by_its_shoulders_without_those_that_are_wrong(bust):
     face = bust.neutral(len(times))
     face.head_translation[:, 2] = -0.8
     face.head_rotation[:, 1] = 0.4 * torch.sin(2 * times)
-    face.identity[bust.build_directions.start + 2] = 1.0
+    face.identity[build_directions(bust).start + 2] = 1.0
     # It sways sideways: one camera does not tell how far away it is.
     sway = 0.01 * torch.sin(times)[:, None] * torch.tensor([1.0, 0, 0])
-    place = known(still_torso(bust, face).torso_translation) + sway
+    place = torso_pose(bust, face[0]).translation + sway
     turn = torch.stack([0 * times, 0.1 * torch.sin(times), 0.1 * torch.cos(times)], dim=1)
-    truth = face.with_torso(turn, place)
+    truth = with_torso(bust, face, TorsoPose(turn, place))
     shoulders = bust.landmark_positions(bust(truth), "shoulders").reshape(len(times), 2, 2, 3).mean(2)
     points = torch.full((len(times), 33, 4), torch.nan)
     points[:, SHOULDERS] = torch.cat([CAMERA.project(shoulders)[0], torch.ones(len(times), 2, 2)], dim=2)
@@ -207,9 +177,10 @@ def test_a_torso_is_found_by_its_shoulders_without_those_that_are_wrong(bust):
     points[9, SHOULDERS[0], :2] += 80.0
     found = fit_torso(bust, replace(face, identity=torch.zeros_like(face.identity)), CAMERA, points, times)
     width = (shoulders[0, 0] - shoulders[0, 1]).norm()
-    assert (known(found.torso_translation) - place).norm(dim=1).max() < 0.04 * width
-    off = torch.rad2deg(known(found.torso_rotation) - turn)
+    pose = torso_pose(bust, found)
+    assert (pose.translation - place).norm(dim=1).max() < 0.04 * width
+    off = torch.rad2deg(pose.rotation - turn)
     assert off[:, 2].abs().max() < 2.0, "shoulders show a roll"
     assert off.norm(dim=1).median() < 6.0
-    assert not found.identity[: bust.build_directions.start].any()
-    assert found.identity[bust.build_directions].norm() > 0.1
+    assert not found.identity[: build_directions(bust).start].any()
+    assert found.identity[build_directions(bust)].norm() > 0.1
