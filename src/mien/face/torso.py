@@ -8,21 +8,17 @@ coefficients `TORSO_SHIFTS`. This module goes from its pose in the world to thes
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mien.face.params import FaceParams
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
+from mien.runtime.torso import FREE, NECK_SHARE, TORSO, TORSO_SHIFTS, StillTorso
 
 if TYPE_CHECKING:
     from mien.face.model import FaceModel
-
-TORSO = "torso"
-"""Name of the joint. A model that has it also has the joint `neck`, and the coefficients `TORSO_SHIFTS`."""
-TORSO_SHIFTS = ("torsoX", "torsoY", "torsoZ")
-"""Names of the coefficients that shift the torso, in metres. They are for no one to set by hand: their bounds are 0."""
-NECK_SHARE = 0.5
-"""Share of the torso's motion that the neck has, so that its middle keeps its girth when the head turns."""
 
 
 class TorsoPose(NamedTuple):
@@ -65,8 +61,13 @@ def motion_of(
 def with_torso(model: "FaceModel", face: FaceParams, pose: TorsoPose) -> FaceParams:
     """Return the same heads on torsos with these poses."""
     rotation, shift = motion_of(pose, face, torso_origin(model, face))
-    turn, free = axis_angle_from_matrix(rotation), model.free_joint_names
-    joints, expression = face.joints.clone(), face.expression.clone()
+    return _against_head(model, face, axis_angle_from_matrix(rotation), shift)
+
+
+def _against_head(
+    model: "FaceModel", face: FaceParams, turn: Float[Tensor, "b 3"], shift: Float[Tensor, "b 3"]
+) -> FaceParams:
+    joints, expression, free = face.joints.clone(), face.expression.clone(), model.free_joint_names
     joints[:, free.index(TORSO)], joints[:, free.index("neck")] = turn, NECK_SHARE * turn
     first = model.expression_names.index(TORSO_SHIFTS[0])
     expression[:, first : first + 3] = shift
@@ -82,12 +83,20 @@ def torso_pose(model: "FaceModel", face: FaceParams) -> TorsoPose:
     return TorsoPose(axis_angle_from_matrix(turned), face.head_translation + (to_world @ place[:, :, None])[:, :, 0])
 
 
-def still_torso(model: "FaceModel", face: FaceParams, like: FaceParams) -> FaceParams:
+def still_torso(model: "FaceModel", face: FaceParams, like: FaceParams, free: float = FREE) -> FaceParams:
     """Return the same heads on a torso that stands where that of `like`, a single timestep, is.
 
-    Faces of a model without a torso come back as they are.
+    A head that goes further than `free` from its place, in metres, takes the torso with it (`StillTorso`). Faces of a
+    model without a torso come back as they are.
     """
     if not has_torso(model):
         return face
     rotation, translation = torso_pose(model, like)
-    return with_torso(model, face, TorsoPose(rotation.expand(len(face), 3), translation.expand(len(face), 3)))
+    arrays = (matrix_from_axis_angle(rotation)[0], translation[0], torso_origin(model, like))
+    still = StillTorso(*map(_as_array, arrays))
+    found = still.against_head(_as_array(face.head_rotation), _as_array(face.head_translation), free)
+    return _against_head(model, face, *(torch.from_numpy(one).to(face.joints) for one in found))
+
+
+def _as_array(values: Tensor) -> np.ndarray:
+    return values.detach().double().cpu().numpy()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
-from mien.face.torso import TORSO, TORSO_SHIFTS
+from mien.runtime.torso import TORSO, TORSO_SHIFTS
 
 _STEP = 0.1
 """Change of an input for differences, in its unit."""

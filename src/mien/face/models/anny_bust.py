@@ -32,9 +32,9 @@ from mien.face.models.anny_source import (
 )
 from mien.face.models.anny_topology import BUST_REGIONS, HeadTopology, cut_bust, cut_head
 from mien.face.models.schema import rounded
-from mien.face.torso import NECK_SHARE, TORSO, TORSO_SHIFTS
 from mien.machine.progress import progress_bar
 from mien.rotation import matrix_from_axis_angle
+from mien.runtime.torso import NECK_SHARE, TORSO, TORSO_SHIFTS
 
 BUILD = 12  # number of identity directions of the build
 _NECK_PLANES = (0.655, 0.578)

@@ -14,9 +14,10 @@ from mien.capture.capture import Capture
 from mien.capture.person.body import BodyReader
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, most_frontal_camera
-from mien.face.torso import TORSO, build_directions
+from mien.face.torso import build_directions
 from mien.machine.progress import say, track_progress
 from mien.rotation import axis_angle_from_matrix, invert_rigid, matrix_from_axis_angle
+from mien.runtime.torso import TORSO
 from mien.tracking.fitting.sequence import FACING
 from mien.tracking.landmarks.torso import SHOULDERS, fit_torso
 from mien.tracking.tracking import Appearance, Tracking
