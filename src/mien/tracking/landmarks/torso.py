@@ -16,11 +16,12 @@ from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.face.torso import TorsoPose, build_directions, motion_of, torso_origin, with_torso
 from mien.rotation import matrix_from_axis_angle
+from mien.tracking.landmarks.clothes import Clothes
 
 SHOULDERS = (11, 12)
 """Points of the pose network: the left and the right shoulder of the person."""
-_ITERATIONS = 300
-_START_TURN = 0.3  # share of the head's turn with which the descent begins
+_ITERATIONS = 200
+_START_TURN = 0.3  # share of the head's turn that the torso is expected to have
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,15 @@ class TorsoPriors:
     still: float = 0.1
     """Of its turn in the room against the pose that it has most, in radians."""
     facing: float = 0.15
-    """Of that pose against the mean of the head's, in radians."""
+    """Of that pose against a share of the mean of the head's, in radians: who turns aside turns the head most."""
     acceleration: float = 1.0
     """In metres per second squared."""
     angular_acceleration: float = 3.0
     """In radians per second squared."""
+    sights: float = 0.01
+    """Of a point on clothes in the picture, in shoulder widths. Clothes slide and fold."""
+    clothes: float = 0.02
+    """Of such a point's distance from where the mesh has it, in metres."""
     response: float = 0.03
     """Of the distance between the network's shoulder and the model's, the same in all frames, in metres."""
 
@@ -52,13 +57,15 @@ def fit_torso(
     points: Float[Tensor, "b 33 4"],
     timestamps: Float[Tensor, " b"],
     known_build: Float[Tensor, " n"] | None = None,
+    clothes: Clothes | None = None,
     priors: TorsoPriors = TorsoPriors(),
 ) -> FaceParams:
     """Return the same faces with a torso and a build that fit the points (x and y in pixels, z, visibility).
 
     The world is one in which a head that faces the camera has a rotation of about zero. Frames without points have NaN.
     z is not used: the network guesses turns of 40 degrees that are not there. The build is what the identity has beyond
-    the directions of the head, which stay as they are. A known build stays, too.
+    the directions of the head, which stay as they are. A known build stays, too. Points on clothes tell turns that
+    shoulders do not.
     """
     like = torch.zeros((), dtype=torch.float64)
     model, face, camera = model.to(like), face.to(like), camera.to(like)
@@ -72,19 +79,25 @@ def fit_torso(
         at_rest,
         face.identity[build] if known_build is None else known_build.to(like),
         like.new_zeros(3),
-        face.head_rotation.mean(0),
+        _START_TURN * face.head_rotation.mean(0),
+        like.new_zeros(0, 3) if clothes is None else clothes.places.to(like),
     )
-    scales = priors.still, priors.shift, 1.0 if known_build is None else 0.0, priors.response, priors.facing
+    free_build = 1.0 if known_build is None else 0.0
+    scales = priors.still, priors.shift, free_build, priors.response, priors.facing, priors.clothes
     unknown = [torch.zeros_like(value).requires_grad_() for value in starts]
     optimizer = torch.optim.LBFGS(unknown, max_iter=_ITERATIONS, history_size=30, line_search_fn="strong_wolfe")
     cost = _cost_of(model, face, camera, (seen, times), priors)
+    cloth_cost = None if clothes is None else _cost_of_clothes(clothes, camera, _width(seen), priors)
 
     def values() -> list[Tensor]:
         return [value + scale * step for value, scale, step in zip(starts, scales, unknown, strict=True)]
 
     def closure() -> Tensor:
         optimizer.zero_grad()
-        value = cost(*values())
+        *first, points_on_clothes = values()
+        value = cost(*first)
+        if cloth_cost is not None:
+            value = value + cloth_cost(first[0], first[1], points_on_clothes)
         value.backward()
         return value
 
@@ -102,12 +115,12 @@ def _cost_of(
     seen, times = given
     visible = seen[..., 3].clamp(0, 1).nan_to_num(0.0)
     there = seen[..., :2].nan_to_num(0.0)
-    width = (there[:, 0] - there[:, 1]).norm(dim=1)[visible.amin(1) > 0.5].median()
+    width = _width(seen)
     steps = 0.5 * (times[2:] - times[:-2])
     mirror = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]).to(times)
     shoulders, build = model.landmarks["shoulders"], build_directions(model)
     origin = torso_origin(model, face)  # No build moves it.
-    ahead = face.head_rotation.mean(0)
+    ahead = _START_TURN * face.head_rotation.mean(0)
 
     def pairs_of(vertices: Tensor) -> Tensor:
         """Return the shoulders, each the mean of two points."""
@@ -134,5 +147,24 @@ def _cost_of(
             bend = (path[2:] - 2 * path[1:-1] + path[:-2]) / steps[:, None] ** 2
             total = total + (bend / sigma).square().sum()
         return total + own.square().sum() + (response / priors.response).square().sum()
+
+    return cost
+
+
+def _width(seen: Float[Tensor, "b 2 4"]) -> Tensor:
+    """Return the distance between the shoulders in pixels, as the median over the frames that show both."""
+    there, visible = seen[..., :2].nan_to_num(0.0), seen[..., 3].nan_to_num(0.0)
+    return (there[:, 0] - there[:, 1]).norm(dim=1)[visible.amin(1) > 0.5].median()
+
+
+def _cost_of_clothes(clothes: Clothes, camera: Camera, width: Tensor, priors: TorsoPriors) -> Callable[..., Tensor]:
+    """Return the cost of points on clothes in terms of the priors, of the torso's turns and places and the points."""
+    known, pixels = clothes.places.to(camera.K), clothes.pixels.to(camera.K)
+
+    def cost(turn: Tensor, place: Tensor, points: Tensor) -> Tensor:
+        rotations = matrix_from_axis_angle(turn)[clothes.frame]
+        world = (rotations @ points[clothes.point][:, :, None])[:, :, 0] + place[clothes.frame]
+        off = (camera.project(world)[0] - pixels) / (priors.sights * width)
+        return torch.log1p((off * off).sum(-1)).sum() + ((points - known) / priors.clothes).square().sum()
 
     return cost

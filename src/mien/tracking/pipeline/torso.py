@@ -19,6 +19,7 @@ from mien.machine.progress import say, track_progress
 from mien.rotation import axis_angle_from_matrix, invert_rigid, matrix_from_axis_angle
 from mien.runtime.torso import TORSO
 from mien.tracking.fitting.sequence import FACING
+from mien.tracking.landmarks.clothes import follow_clothes
 from mien.tracking.landmarks.torso import SHOULDERS, fit_torso
 from mien.tracking.tracking import Appearance, Tracking
 
@@ -114,6 +115,10 @@ def _fit(
     view = Camera(camera.K, invert_rigid(facing), camera.width, camera.height)
     times = torch.from_numpy(np.asarray(capture.timestamps))
     fitted = fit_torso(model, there, view, bodies.points, times, build)
+    images, mattes = (frames[:, bodies.camera] for frames in (capture.images, capture.mattes))
+    clothes = follow_clothes(images, mattes, model, fitted, view)
+    if len(clothes.point):
+        fitted = fit_torso(model, there, view, bodies.points, times, build, clothes)
     return replace(face, identity=fitted.identity, expression=fitted.expression, joints=fitted.joints)
 
 
