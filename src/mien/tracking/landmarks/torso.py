@@ -20,7 +20,7 @@ from mien.tracking.landmarks.clothes import Clothes
 
 SHOULDERS = (11, 12)
 """Points of the pose network: the left and the right shoulder of the person."""
-_ITERATIONS = 200
+_ITERATIONS = 300
 _START_TURN = 0.3  # share of the head's turn that the torso is expected to have
 
 
