@@ -36,8 +36,9 @@ class TorsoPriors:
     """Of its turn against the head, about each axis, in radians."""
     still: float = 0.1
     """Of its turn in the room against the pose that it has most, in radians."""
-    facing: float = 0.15
-    """Of that pose against a share of the mean of the head's, in radians: who turns aside turns the head most."""
+    facing: tuple[float, float, float] = (0.15, 0.15, 0.07)
+    """Of that pose against a share of the mean of the head's, in radians: who turns aside turns the head most, and
+    shoulders are about level."""
     acceleration: float = 1.0
     """In metres per second squared."""
     angular_acceleration: float = 3.0
@@ -46,8 +47,16 @@ class TorsoPriors:
     """Of a point on clothes in the picture, in shoulder widths. Clothes slide and fold."""
     clothes: float = 0.02
     """Of such a point's distance from where the mesh has it, in metres."""
-    response: float = 0.03
-    """Of the distance between the network's shoulder and the model's, the same in all frames, in metres."""
+    response: float = 0.015
+    """Of the distance between the network's shoulders and the model's, the same in all frames and for both sides, in
+    metres."""
+    uneven: tuple[float, float] = (0.02, 0.01)
+    """Of both together to one side, and of one upwards and the other downwards, in metres."""
+
+    @property
+    def responses(self) -> tuple[float, ...]:
+        """Those of all parts of the response: `response` of each axis, then `uneven`."""
+        return (*[self.response] * 3, *self.uneven)
 
 
 def fit_torso(
@@ -78,12 +87,13 @@ def fit_torso(
         _START_TURN * face.head_rotation,
         at_rest,
         face.identity[build] if known_build is None else known_build.to(like),
-        like.new_zeros(3),
+        like.new_zeros(5),
         _START_TURN * face.head_rotation.mean(0),
         like.new_zeros(0, 3) if clothes is None else clothes.places.to(like),
     )
     free_build = 1.0 if known_build is None else 0.0
-    scales = priors.still, priors.shift, free_build, priors.response, priors.facing, priors.clothes
+    responses, facing = (like.new_tensor(own) for own in (priors.responses, priors.facing))
+    scales = priors.still, priors.shift, free_build, responses, facing, priors.clothes
     unknown = [torch.zeros_like(value).requires_grad_() for value in starts]
     optimizer = torch.optim.LBFGS(unknown, max_iter=_ITERATIONS, history_size=30, line_search_fn="strong_wolfe")
     cost = _cost_of(model, face, camera, (seen, times), priors)
@@ -120,6 +130,7 @@ def _cost_of(
     mirror = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]).to(times)
     shoulders, build = model.landmarks["shoulders"], build_directions(model)
     origin = torso_origin(model, face)  # No build moves it.
+    responses, facing = (times.new_tensor(own) for own in (priors.responses, priors.facing))
     ahead = _START_TURN * face.head_rotation.mean(0)
 
     def pairs_of(vertices: Tensor) -> Tensor:
@@ -133,7 +144,8 @@ def _cost_of(
     directions = pairs_of(model.identity_basis[build])
 
     def cost(turn: Tensor, place: Tensor, own: Tensor, response: Tensor, most: Tensor) -> Tensor:
-        local = rest + torch.einsum("i,ikc->kc", own, directions) - origin + mirror * response
+        local = rest + torch.einsum("i,ikc->kc", own, directions) - origin + mirror * response[:3]
+        local = local + torch.stack([response[3].expand(2), mirror[:, 0] * response[4], 0 * mirror[:, 0]], 1)
         world = local @ matrix_from_axis_angle(turn).mT + place[:, None]
         off = (camera.project(world)[0] - there) / (priors.pixels * width)
         # Cauchy: a shoulder that is far off is a wrong one.
@@ -142,11 +154,11 @@ def _cost_of(
         # Twice the sine of half the angle: it is smooth where an angle is not.
         turned = 0.5 * (relative - torch.eye(3).to(relative)).square().sum()
         total = total + (shift / priors.shift).square().sum() + turned / priors.turn**2
-        total = total + ((turn - most) / priors.still).square().sum() + ((most - ahead) / priors.facing).square().sum()
+        total = total + ((turn - most) / priors.still).square().sum() + ((most - ahead) / facing).square().sum()
         for path, sigma in ((place, priors.acceleration), (turn, priors.angular_acceleration)):
             bend = (path[2:] - 2 * path[1:-1] + path[:-2]) / steps[:, None] ** 2
             total = total + (bend / sigma).square().sum()
-        return total + own.square().sum() + (response / priors.response).square().sum()
+        return total + own.square().sum() + (response / responses).square().sum()
 
     return cost
 
