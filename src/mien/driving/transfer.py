@@ -102,10 +102,8 @@ def place_torso(
     if not has_torso(model):
         return driven
     if torso == "head" or (torso == "driver" and driver is None):
-        with_head = replace(person, **{name: getattr(driven, name) for name in ("head_rotation", "head_translation")})
-        count = len(driven)
-        joints, shifts = person.joints.expand(count, -1, -1), person.expression.expand(count, -1)
-        return with_torso(model, driven, torso_pose(model, replace(with_head, joints=joints, expression=shifts)))
+        poses = {name: getattr(driven, name) for name in ("head_rotation", "head_translation")}
+        return with_torso(model, driven, torso_pose(model, replace(person[[0] * len(driven)], **poses)))
     if torso == "still" or driver is None:
         return still_torso(model, driven, person)
     rest, (now, calm) = torso_pose(model, person), (torso_pose(model, one) for one in driver)
