@@ -336,8 +336,7 @@ void bake_texture(const Mesh& mesh, const TexturedSurface& surface, const AlignF
       out.image[3 * texel + c] += weight * color[c] * color[c];
     }
   };
-  const int64_t columns = surface.texture_width;
-  parallel_for(surface.texture_height, [&](int64_t row) {
+  parallel_for(surface.texture_height, [&, columns = int64_t{surface.texture_width}](int64_t row) {
     for (int64_t texel = row * columns; texel < (row + 1) * columns; ++texel) add_texel(texel);
   });
 }

@@ -3,6 +3,7 @@
 import { copyFace, motionFace, motionLength, Poser, setNamed, type Avatar, type Face, type Motion } from "./index";
 import { SimdPosing } from "./simd";
 import { chained, moved, rigid, rotationMatrix, transposed } from "./rigid";
+import { standStill } from "./torso";
 
 const SH_C0 = 0.28209479177387814;
 const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
@@ -337,6 +338,7 @@ export class Actor {
     const shown = copyFace(this.face), m = this.matrix();
     if (this.target) this.gaze(shown, this.target, m);
     this.alive?.(shown);
+    standStill(shown, this.avatar);
     const motion = this.headMotion(shown), h = [0, 1, 2, 3].flatMap((column) => [motion[column], motion[4 + column], motion[8 + column], column === 3 ? 1 : 0]);
     this.source.pose(shown, into, { first, eye: eye && local ? inside(m, eye) : eye, transform: local ? h : product(m, h) });
     this.stale = false;

@@ -4,6 +4,7 @@ export type { Avatar, Baked, BlendSkinned, Camera, Face, MeshBound, Motion, Rig,
 export { AvatarError, readAny, readMien, readPacked } from "./format";
 export { presets, rangeOf, setNamed } from "./named";
 export { Poser } from "./rig";
+export { standStill } from "./torso";
 export { DepthSorter } from "./sort";
 export { Renderer } from "./renderer";
 export type { Backend, Color, Drawer, View } from "./renderer";

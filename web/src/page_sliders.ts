@@ -63,8 +63,9 @@ export function addSliders(viewer: Viewer, place: HTMLElement, touched: () => vo
     });
     if (rows.length) place.append(element("details", {}, element("summary", {}, title), ...rows));
   }
+  const placed = avatar.joint_names.includes("torso") ? ["torso", "neck"] : []; // by `standStill`
   const joints = avatar.joint_names.flatMap((name, joint) =>
-    AXES.map((axis, k) => {
+    placed.includes(name) ? [] : AXES.map((axis, k) => {
       const at = 3 * joint + k, id = `${name}_${"xyz"[k]}`;
       return slider(`${readable(name)} ${axis}`, id, [-MOST_ANGLE, MOST_ANGLE], neutral.expression.length + at, () => face.joints[at], (value) => (face.joints[at] = value));
     }),

@@ -5,6 +5,7 @@ import { setNamed } from "./named";
 import { Renderer, type Backend, type Color, type Drawer, type View } from "./renderer";
 import { Poser } from "./rig";
 import { chained, moved, rigid, rotationMatrix } from "./rigid";
+import { standStill } from "./torso";
 import { DepthSorter } from "./sort";
 
 /** Turns beyond this would show the head upside down, in radians. */
@@ -169,7 +170,9 @@ export class Viewer {
     const began = performance.now(), { width, height } = this.canvas;
     this.stale = false;
     if (!this.posed) {
-      if (this.alive && !this.playing) this.alive((this.shown = copyFace(this.face)));
+      this.shown = copyFace(this.face);
+      if (this.alive && !this.playing) this.alive(this.shown);
+      standStill(this.shown, this.avatar);
       this.poser.pose(this.shown);
       this.renderer.upload();
       this.posed = true;

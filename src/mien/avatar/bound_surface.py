@@ -20,6 +20,7 @@ from mien.avatar.store import GaussianStore
 from mien.gaussians import sh_from_rgb
 
 FILL_OPACITY = 0.97  # opacity of a fill
+LEAST_OPACITY = 1e-4  # the least that a limit leaves of a Gaussian's opacity
 _FILL_HEIGHT_SHARE = 0.9
 """Height of a fill as a share of the hair's. Hair is thinner at its outline, and a higher fill stands out beyond it.
 Measured: 0.5 has 0.2 dB more at 30 degrees and 0.3 less at 90, and 1 has 0.2 dB less at 30 (log, 11-24)."""
@@ -56,6 +57,8 @@ class SurfacePrior:
     parts: Int[Tensor, " f"] | None = None
     """A number for each triangle's part, or -1 on the scalp. Gaussians that are bound anew stay on it, and on the scalp
     none is: it does not bend, and hair is far from it. None means one part."""
+    opacities: Float[Tensor, " f"] | None = None
+    """Largest opacity of a Gaussian on each triangle. None means 1."""
     carrier: int | None = None
     """Triangle that no expression moves. What is rigid is bound to it, without limits. None: nothing is looked for."""
 
@@ -148,8 +151,15 @@ class BoundSurface:
 
     @torch.no_grad()
     def keep_to(self, prior: SurfacePrior) -> None:
-        """Bring Gaussians that left the surface back, and pull colours of what is rarely seen to the completed ones."""
+        """Bring Gaussians that left the surface back, and pull colours of what is rarely seen to the completed ones.
+
+        Opacities stay within their limits.
+        """
         limits, pulls = self._limits_and_pulls(prior)
+        if prior.opacities is not None:
+            most = torch.logit(prior.opacities, LEAST_OPACITY).index_select(0, self.triangles())
+            logits = self._store["opacity_logits"].detach()
+            torch.minimum(logits, most.to(logits), out=logits)
         if limits is not None:
             keep_on_surface(self._store, limits, pulls)
         elif pulls is not None:

@@ -164,6 +164,7 @@ class Command:
 
     def _check_files(self, workspace: Workspace, run: str) -> None:
         """Check what needs heavy libraries: the run, the cameras, the face model, the masks and the videos."""
+        from mien.face.torso import has_torso
         from mien.machine.progress import say
         from mien.pipeline.capture import check_camera_ids, check_captured
         from mien.pipeline.face_models import face_model_of
@@ -177,8 +178,8 @@ class Command:
             check_camera_ids(self.calibration, settings.held_out_cameras)
         check_untouched(run_dir)
         self.options.say_what_is_ignored()
-        face_model_of(self.face_model)
-        check_masks(workspace, workspace.sequence_names(), self.scoring.cut_after(self.tracking))
+        torso = has_torso(face_model_of(self.face_model))
+        check_masks(workspace, workspace.sequence_names(), self.scoring.cut_after(self.tracking, torso=torso))
         if self.calibration is None:
             names = sequence_names(self.videos, self.name)
             check_videos(run_dir, names, workspace.sequence_names())

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -14,6 +14,9 @@ from mien.errors import UserError
 from mien.media.camera_names import CameraFormat, camera_named, is_camera
 from mien.pipeline.names import PORT, check_avatar, check_driver, check_neutral, check_viewer, has_viewer
 from mien.pipeline.picture_options import PictureOptions
+
+if TYPE_CHECKING:
+    from mien.driving.follower import FollowOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +48,18 @@ class _Film:
     unlimited: bool = False
     """Follow the driver however far. By default, turns of the head and rare expressions that go beyond what the avatar
     was filmed in are softened, because it has never seen them."""
+    torso: Literal["still", "driver", "head"] = "still"
+    """What the torso of an avatar with shoulders does. still: it stands, and only the head moves. driver: it follows
+    the driver's torso, if the driver is filmed and has one. head: it moves with the head."""
     alone: bool = False
     """Show only the avatar, without the driver's pictures beside it."""
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = field(default_factory=PictureOptions)
+
+    def following(self) -> "FollowOptions":
+        """Return how the avatar follows."""
+        from mien.driving.follower import FollowOptions
+
+        return FollowOptions(self.head_pose, self.unlimited, self.torso)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,14 +92,13 @@ class Film(_Neutral, _Film, _Drive):
 
     def run(self) -> None:
         """Track the driver if necessary, then pose and render every timestep."""
-        from mien.driving.follower import FollowOptions
         from mien.pipeline.drive import run_driving_stage
 
         workspace = open_workspace(self.workspace)
         run_driving_stage(
             workspace.run_dir(workspace.pick_run(self.run_name)), Path(self.by), self.out, self.picture,
-            FollowOptions(self.head_pose, self.unlimited), sequence=self.sequence, fps=self.fps, neutral=self.neutral,
-            capture=self.capture, alone=self.alone,
+            self.following(), sequence=self.sequence, fps=self.fps, neutral=self.neutral, capture=self.capture,
+            alone=self.alone,
         )  # fmt: skip
 
 
@@ -140,10 +151,9 @@ class Follow(_Film, _Drive):
 
     def run(self) -> None:
         """Follow until Ctrl-C, or until the file of a camera ends."""
-        from mien.driving.follower import FollowOptions
         from mien.pipeline.follow import run_following_stage
 
-        camera, follow = camera_named(self.by, self.camera_format), FollowOptions(self.head_pose, self.unlimited)
+        camera, follow = camera_named(self.by, self.camera_format), self.following()
         port = self.port if has_viewer() else None
         run_following_stage(self.workspace, self.run_name, camera, follow, self.picture, self.out, self.alone, port)
 

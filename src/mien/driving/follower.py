@@ -17,7 +17,7 @@ from jaxtyping import Float
 from mien.avatar.baking import as_array
 from mien.driving.landmark_fit import Fitted, LandmarkFit
 from mien.driving.rest import REST_HEAD, kept_share, rest_of
-from mien.driving.transfer import drive, keep_to_filmed
+from mien.driving.transfer import Torso, drive, keep_to_filmed, place_torso
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
 from mien.runtime.baked import Filmed
@@ -82,6 +82,7 @@ class FollowOptions:
     head_pose: bool = True
     unlimited: bool = False
     """Whether the avatar follows also beyond what it was filmed with."""
+    torso: Torso = "still"
 
 
 class Follower:
@@ -193,6 +194,7 @@ class Follower:
         face = drive(driver, at_rest, self._at_rest, bounds, self._options.head_pose)
         if self._filmed is not None:
             face = keep_to_filmed(face, self._filmed, self._person, self._model, self._eye)[0]
+        face = place_torso(self._model, face, self._person, self._options.torso)
         return Face(
             *(as_array(field)[0] for field in (face.expression, face.joints, face.head_rotation, face.head_translation))
         )

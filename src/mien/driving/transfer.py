@@ -5,6 +5,7 @@ Expressions, gaze and head poses that training never saw are softened (`keep_to_
 
 from collections import Counter
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from mien.errors import UserError
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.face.torso import TorsoPose, has_torso, still_torso, torso_pose, with_torso
 from mien.rotation import axis_angle_from_matrix, matrix_from_axis_angle
 from mien.runtime.baked import Filmed
 from mien.runtime.filmed import within_filmed_inputs, within_filmed_poses
@@ -79,6 +81,39 @@ def _relative_rotation(
     """Axis-angle vectors of the avatar's neutral rotation times the driver's rotation relative to its neutral."""
     motion = matrix_from_axis_angle(driver_neutral).transpose(-1, -2) @ matrix_from_axis_angle(driver)
     return axis_angle_from_matrix(matrix_from_axis_angle(avatar_neutral) @ motion)
+
+
+Torso = Literal["still", "driver", "head"]
+"""What the torso of an avatar does: it stands still, follows the driver's torso, or moves with the head."""
+
+
+def place_torso(
+    model: FaceModel,
+    driven: FaceParams,
+    person: FaceParams,
+    torso: Torso = "still",
+    driver: tuple[FaceParams, FaceParams] | None = None,
+) -> FaceParams:
+    """Return driven faces with their torso in its place; `person` is the avatar's person at rest, one timestep.
+
+    `driver` are the driver's faces and its neutral, of the same face model. A recording knows no torso, so a torso that
+    follows it moves with the head. Faces of a model without a torso come back as they are.
+    """
+    if not has_torso(model):
+        return driven
+    if torso == "head" or (torso == "driver" and driver is None):
+        poses = {name: getattr(driven, name) for name in ("head_rotation", "head_translation")}
+        return with_torso(model, driven, torso_pose(model, replace(person[[0] * len(driven)], **poses)))
+    if torso == "still" or driver is None:
+        return still_torso(model, driven, person)
+    rest, (now, calm) = torso_pose(model, person), (torso_pose(model, one) for one in driver)
+    there, here = (matrix_from_axis_angle(one.head_rotation)[0] for one in (driver[1], person))
+    moved = (now.translation - calm.translation) @ there @ here.T
+    return with_torso(
+        model,
+        driven,
+        TorsoPose(_relative_rotation(now.rotation, calm.rotation, rest.rotation), rest.translation + moved),
+    )
 
 
 def face_of_motion(motion: Motion, model: FaceModel) -> tuple[FaceParams, FaceParams]:

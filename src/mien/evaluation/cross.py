@@ -18,7 +18,7 @@ from mien.capture.capture import Capture
 from mien.capture.person.faces import MeshReader
 from mien.capture.store import read_capture, read_capture_hash
 from mien.driving.rest import rest_before
-from mien.driving.transfer import drive
+from mien.driving.transfer import drive, place_torso
 from mien.errors import UserError
 from mien.evaluation.redetection import MEASURED_BY, MeasuredMotion, measure_motion, transfer_figures
 from mien.evaluation.videos import labeled_row, match_sizes
@@ -84,6 +84,7 @@ def load_driven(run_dir: Path, sequence_dir: Path, driver_dir: Path) -> Driven:
     calm = neutral_of(tracking.face[tracking.valid])
     at_rest, person = rest_before(calm, model, tracking.cameras).face, rest_before(avatar.subject, model, cameras).face
     faces = drive(tracking.face, at_rest, person, model.expression_bounds, who=str(driver_dir))
+    faces = place_torso(model, faces, avatar.subject)
     return Driven(
         avatar=avatar,
         camera=cameras[most_frontal_camera(cameras, avatar.subject)],

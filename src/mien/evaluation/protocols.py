@@ -66,6 +66,7 @@ _ALWAYS = {f"{part}{metric}" for part in ("", "head_") for metric in ("psnr", "s
 _MASKS = {
     "plane": "frozen scoring mask: matte cut at the neck, over white",
     "line": "frozen scoring mask: matte above the neck line of each picture, over white",
+    "none": "frozen scoring mask: matte of the whole person, over white",
 }
 _MATTES = "the dataset's mattes, whole, over white"
 _CROP = "frozen head box of each frame"

@@ -1,4 +1,4 @@
-"""Triangles of a face model that are hair, skin, neck, eyes and the inside of the mouth, and colours of the latter.
+"""Triangles of a face model that are hair, skin, neck, bust, eyes and the inside of the mouth; colours of the latter.
 
 Also, where eyes and mouth of a posed face model are in a picture.
 """
@@ -29,7 +29,7 @@ _PAINTED = ("lips", "brows")
 
 @dataclass(frozen=True, eq=False)
 class HeadParts:
-    """Parts of a face model. Each triangle belongs to exactly one of scalp, skin, painted, neck, eyes and interior."""
+    """Parts of a face model. Each triangle is in exactly one of scalp, skin, painted, neck, bust, eyes and interior."""
 
     scalp: Bool[Tensor, " f"]
     """Where hair grows."""
@@ -40,6 +40,8 @@ class HeadParts:
     painted: tuple[Bool[Tensor, " f"], ...]
     """Lips and brows."""
     neck: Bool[Tensor, " f"]
+    bust: Bool[Tensor, " f"]
+    """What is below the neck, in clothes."""
     eyes: tuple[Bool[Tensor, " f"], ...]
     """The white of the eyes, and the irises."""
     mouth: Bool[Tensor, " f"]
@@ -61,6 +63,7 @@ class HeadParts:
             (self.scalp, self.scalp),
             (self.skin, self.skin),
             (self.neck, near_neck),
+            (self.bust, self.bust),
             *((part, part) for part in (*self.painted, *self.eyes)),
         ]
 
@@ -74,8 +77,8 @@ def head_parts(face_model: FaceModel) -> HeadParts:
 
     eyes, irises = region("eyes"), region("irises")
     teeth, tongue, mouth = region("teeth"), region("tongue"), region("mouth")
-    neck = region("neck")
-    free = ~(eyes | irises | teeth | tongue | mouth | neck)
+    neck, bust = region("neck"), region("bust")
+    free = ~(eyes | irises | teeth | tongue | mouth | neck | bust)
     if not bool(mouth.any()):
         mouth = free & _inside_mouth(face_model, middles)
         free = free & ~mouth
@@ -85,7 +88,7 @@ def head_parts(face_model: FaceModel) -> HeadParts:
     lips = region("lips")
     front = middles[lips if bool(lips.any()) else skin, 2].max() if bool(skin.any()) else middles[:, 2].max()
     face = region(*_FACE) & skin
-    return HeadParts(scalp, skin, face, painted, neck, (eyes, irises), mouth, teeth, tongue, float(front))
+    return HeadParts(scalp, skin, face, painted, neck, bust, (eyes, irises), mouth, teeth, tongue, float(front))
 
 
 def _above_hairline(middles: Float[Tensor, "f 3"]) -> Bool[Tensor, " f"]:

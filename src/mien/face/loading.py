@@ -33,9 +33,11 @@ from mien.face.listing import (
     with_ending,
 )
 from mien.face.model import FaceModel, Landmarks
+from mien.plugins import named
 
 TENSORS = tuple(AXES)
 _BASE = "anny"  # the face model whose mesh, joints and landmarks `coefficients-N` has
+_BUST = "anny-bust"  # the face model that has the same head, and its landmarks
 _NAME = re.compile(r"coefficients-([1-9][0-9]{0,2})")
 _LANDMARK_SUFFIX = ".landmarks.json"
 _NO_TEETH = "-no-teeth"
@@ -72,6 +74,16 @@ def load_face_model_without_landmarks(name: str) -> FaceModel:
         return model
 
 
+def head_only(model: FaceModel) -> FaceModel:
+    """Return the head-only model whose head a model with a torso has."""
+    return load_face_model(model.name.replace(_BUST, _BASE))
+
+
+def bake_bust() -> FaceModel:
+    """Build the bust on the head-only model of the cache."""
+    return named("mien.face.models.anny_bust:bake_anny_bust")(load_face_model_without_landmarks(_BASE))
+
+
 def coefficient_count(name: str) -> int | None:
     """Return the number of coefficients of the face model `coefficients-N`, or None for other names."""
     found = _NAME.fullmatch(name)
@@ -95,11 +107,14 @@ def coefficient_head(base: FaceModel, count: int) -> FaceModel:
 
 def without_teeth(model: FaceModel) -> FaceModel:
     """Return the face model without the triangles of teeth. Its vertices stay."""
-    kept = ~model.region_mask("teeth")
+    return replace(_without(model, "teeth"), name=f"{model.name}{_NO_TEETH}")
+
+
+def _without(model: FaceModel, region: str) -> FaceModel:
+    kept = ~model.region_mask(region)
     place = (torch.cumsum(kept.long(), 0) - 1).clamp_min(0)
     return replace(
         model,
-        name=f"{model.name}{_NO_TEETH}",
         faces=model.faces[kept],
         uv_faces=model.uv_faces[kept],
         face_regions=model.face_regions[kept],
@@ -164,10 +179,16 @@ def read_landmarks(name: str, model: FaceModel) -> dict[str, Landmarks]:
     """Return the landmark sets of a face model: those that ship with mien, or those placed when the user added it."""
     if not is_plain_name(name):
         raise UserError(f"{name!r:.100} cannot be the name of a face model; choose one of `mien face-models`")
+    if name == _BUST:
+        # The triangles of the head come first, and lie on the same vertices.
+        return {**read_landmarks(_BASE, _without(model, "bust")), **_read_landmark_file(_shipped(name), name, model)}
     name = name if coefficient_count(name) is None else _BASE
-    shipped = Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
-    file = shipped if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)
+    file = _shipped(name) if name in SOURCES else with_ending(added_file(name), _LANDMARK_SUFFIX)
     return _read_landmark_file(file, name, model) if file.is_file() else {}
+
+
+def _shipped(name: str) -> Path:
+    return Path(str(resources.files("mien.face") / "data" / f"{name}_landmarks.json"))
 
 
 def _read_landmark_file(file: Path, name: str, model: FaceModel) -> dict[str, Landmarks]:

@@ -15,7 +15,7 @@ from mien.disk.workspace import Workspace, open_workspace
 from mien.driving.drivers import Driver, read_recording, read_tracked_driver, with_neutral
 from mien.driving.follower import FollowOptions
 from mien.driving.rest import facing, rest_of
-from mien.driving.transfer import drive, keep_to_filmed
+from mien.driving.transfer import drive, keep_to_filmed, place_torso
 from mien.face.cache import cache_folder, cache_is_kept
 from mien.face.model import FaceModel
 from mien.machine.progress import say, track_progress
@@ -143,6 +143,8 @@ def run_driving_stage(
         if softened:
             say(f"{softened} of {len(driven)} frames go beyond what was filmed and are softened; --unlimited lets go")
             say(f"softened most: {', '.join(parts[:5])}")
+    of_driver = driver.face, driver.at_rest
+    driven = place_torso(avatar.face_model, driven, avatar.subject, follow.torso, of_driver)
     beside = None if alone or output.transparent else driver.pictures
     pose = posed_softly(avatar)
 

@@ -12,7 +12,7 @@ from mien.avatar.baking import as_array, bake_rig, make_portable
 from mien.avatar.files import load_avatar
 from mien.disk.workspace import Workspace
 from mien.driving.rest import facing, rest_of
-from mien.driving.transfer import drive
+from mien.driving.transfer import drive, place_torso
 from mien.face.params import FaceParams
 from mien.formats.format import Content, MotionOptions, NoOptions, PoseOptions
 from mien.formats.glb import MeshModel
@@ -98,6 +98,7 @@ class RunContent(Content):
         driver = open_driver(by, motion.series if own else None, model, neutral=motion.neutral)
         person = rest_of(subject, model, facing(run_camera(self._run_dir).viewmat)).face
         driven = drive(driver.face, driver.at_rest, person, model.expression_bounds, with_head_pose, motion.series)
+        driven = place_torso(model, driven, subject)
         face = with_expression(driven[:: motion.every], model, self._expression, self._avatar.filmed)
         return face, driver.fps / motion.every
 

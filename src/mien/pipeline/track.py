@@ -19,6 +19,7 @@ from mien.errors import UserError
 from mien.face.checks import check_face_params
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
+from mien.face.torso import has_torso
 from mien.machine.progress import say, without_bars
 from mien.media.video import count_frames
 from mien.pipeline.face_models import face_model_of
@@ -39,6 +40,9 @@ no longer count as current."""
 
 _DESCENT_RECIPE = "descent 4"
 """The same for what only the schedule `paper` does."""
+
+_TORSO_RECIPE = "torso 1"
+"""The same for torsos."""
 
 DEFAULT_SCORING = ScoringSettings()
 
@@ -70,7 +74,7 @@ def run_tracking_stage(
     if not names:
         raise UserError(f"{workspace.root}: no sequences to track; add one with `mien capture VIDEO`")
     _check_apart(names, hold_out)
-    cut = scoring.cut_after(settings)
+    cut = scoring.cut_after(settings, torso=has_torso(face_model))
     check_masks(workspace, names, cut)
     with suppress(UserError):  # it is reported when the results are written again
         fingerprint = tracking_fingerprint(workspace, names, face_model, settings, hold_out)
@@ -161,6 +165,7 @@ def tracking_fingerprint(
     content = [_TRACKING_RECIPE, captures, face_model.name, face_model.content_hash, asdict(settings.in_effect())]
     content += [sorted(set(hold_out))] if hold_out else []
     content += [_DESCENT_RECIPE] if settings.schedule == "paper" else []
+    content += [_TORSO_RECIPE] if has_torso(face_model) else []
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 

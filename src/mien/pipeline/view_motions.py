@@ -14,7 +14,7 @@ from mien.capture.settings import CaptureSettings
 from mien.disk.workspace import open_workspace
 from mien.driving.follower import Follower, FollowOptions
 from mien.driving.rest import facing, rest_of
-from mien.driving.transfer import drive, keep_to_filmed
+from mien.driving.transfer import drive, keep_to_filmed, place_torso
 from mien.errors import UserError
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
@@ -80,6 +80,7 @@ def clip_of(
         if portable.filmed is not None:
             eye = _position(portable.camera)
             face = keep_to_filmed(face, portable.filmed, subject, model, eye)[0]
+        face = place_torso(model, face, subject)
         fields = (face.expression, face.joints, face.head_rotation, face.head_translation)
         return Clip(Motion(*map(as_array, fields), fps=driver.fps), driver.pictures)
 

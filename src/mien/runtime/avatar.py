@@ -15,6 +15,7 @@ from mien.runtime.filmed import with_filmed_blinks
 from mien.runtime.named import Part, is_gaze, parts_of, presets_for, turned_eyes
 from mien.runtime.posing import Face, Gaussians, pose
 from mien.runtime.rotation import compose_rigid
+from mien.runtime.torso import TORSO, on_still_torso
 
 Vector = Sequence[float | int] | np.ndarray
 """Three numbers."""
@@ -54,12 +55,14 @@ class Avatar:
         if isinstance(expression, Mapping):
             expression, look = self._coefficients(expression)
             looking = turned_eyes(looking, self.joint_names, look)
-        return Face(
+        face = Face(
             _with_named(rest.expression, expression, self.expression_names, "expression"),
             _with_named(looking, joints, self.joint_names, "joint"),
             _vector(rest.head_rotation, head_rotation, "head_rotation"),
             _vector(rest.head_translation, head_translation, "head_translation"),
         )
+        whole = isinstance(joints, np.ndarray) or (joints is not None and TORSO in joints)
+        return face if whole else on_still_torso(self.portable, face)
 
     def pose(
         self,
@@ -73,7 +76,8 @@ class Avatar:
         Args:
             expression: Coefficients by name (others stay at rest), or all of them in the order of `expression_names`.
                 ARKit's names of gaze, such as eyeLookUpLeft, turn the eyes by up to 30 degrees from where they look at
-                rest. Names of preset faces, such as smile, stand for several expressions, within their bounds.
+                rest. Names of preset faces, such as smile, stand for several expressions, within their bounds. A torso,
+                if the avatar has one, stands still while the head moves, unless `joints` has it.
             joints: Axis-angle vectors in radians by name, or all of them [j, 3] in the order of `joint_names`.
             head_rotation: Axis-angle vector of the head in world space, in radians.
             head_translation: Position of the head's origin in world space, in metres.

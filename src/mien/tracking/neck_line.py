@@ -18,8 +18,8 @@ _STEEPEST = 0.7  # least sine of the angle between line and neck in a picture, a
 
 
 def bottom_vertices(face_model: FaceModel) -> Int[Tensor, " n"]:
-    """The vertices of the mesh's lowest open boundary: the base of the neck."""
-    faces = face_model.faces
+    """The vertices of the base of the neck: the mesh's lowest open boundary, or where a bust begins below it."""
+    faces = face_model.faces[~face_model.region_mask("bust")]
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
     unique, counts = edges.unique(dim=0, return_counts=True)
     boundary = unique[counts == 1].numpy()

@@ -31,9 +31,11 @@ class Scoring:
     """The parts of the pictures of t timesteps and c cameras that are trained on and scored."""
 
     masks: UInt8[np.ndarray, "t c h w"]
-    """Opacity of the head (255 is head): the matte, cut at the neck. It is a memory map if there are many."""
+    """Opacity of the head (255 is head): the matte, cut at the neck, or of the person if nothing is cut. It is a
+    memory map if there are many."""
     crops: Int[np.ndarray, "t c 4"]
-    """Left, top, width and height of the head crop in pixels: the box of the mask."""
+    """Left, top, width and height of the head crop in pixels: the box of the mask, of the cut `plane` if nothing is
+    cut."""
     cut: Cut = "plane"
     """Lower end of the head (`ScoringSettings.cut`)."""
 
@@ -49,17 +51,19 @@ def make_scoring(
 
     With the cut `plane`, a pixel keeps its matte if it is above the neck cut and not far beside the neck, or inside the
     projected head, because a lowered chin is below the cut. Parts that are then not connected to the head are removed.
-    With the cut `line`, a pixel keeps its matte if it is above the projected neck line, and nothing else counts.
+    With the cut `line`, a pixel keeps its matte if it is above the projected neck line, and nothing else counts. With
+    `none`, all of the matte that is connected to the head stays.
     """
     masks = PictureStack(capture.mattes.shape, scratch)
     crops = np.zeros((*capture.mattes.shape[:2], 4), np.int64)
     neck = NeckParts.of(face_model)
     for timestep in track_progress(range(capture.timesteps), "Scoring masks", capture.timesteps):
-        keep = (head_cutter if cut == "plane" else line_cutter)(face_model, neck, tracking.face[timestep])
+        keep = (line_cutter if cut == "line" else head_cutter)(face_model, neck, tracking.face[timestep])
         for index, camera in enumerate(tracking.cameras):
-            mask = keep(np.asarray(capture.mattes[timestep, index]), camera)
-            masks.write(timestep, index, mask)
+            matte = np.asarray(capture.mattes[timestep, index])
+            mask = keep(matte, camera)
             crops[timestep, index] = head_crop(mask)
+            masks.write(timestep, index, connected(matte, mask) if cut == "none" else mask)
     return Scoring(masks.array(), crops, cut)
 
 
@@ -82,7 +86,7 @@ def head_cutter(
 ) -> Callable[[UInt8[np.ndarray, "h w"], Camera], UInt8[np.ndarray, "h w"]]:
     """A function that turns a camera's matte into the mask of the head, for one timestep (`make_scoring`)."""
     vertices = face_model(face)[0]
-    head_faces = face_model.faces[~face_model.region_mask("neck")]
+    head_faces = face_model.faces[~face_model.region_mask("neck", "bust")]
     cut = fit_neck_cut(neck, vertices, face.T_world_head[0, :3, 1])
 
     return lambda matte, camera: head_mask(matte, camera, vertices, head_faces, cut)
@@ -110,8 +114,13 @@ def cut_matte(
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
         head = cv2.dilate(head.astype(np.uint8), disc).astype(bool)
     mask = np.round(matte * np.where(head, np.float32(1), keep)).astype(np.uint8)
+    return connected(mask, head)
+
+
+def connected(mask: UInt8[np.ndarray, "h w"], head: np.ndarray) -> UInt8[np.ndarray, "h w"]:
+    """The mask without parts that do not touch the head."""
     _, labels = cv2.connectedComponents((mask >= _FAINT).astype(np.uint8))
-    ours = np.unique(labels[head & (labels > 0)])
+    ours = np.unique(labels[(head > 0) & (labels > 0)])
     return np.where((labels == 0) | np.isin(labels, ours), mask, 0).astype(np.uint8)
 
 

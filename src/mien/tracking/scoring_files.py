@@ -128,8 +128,8 @@ def _write_into(folder: Path, scoring: Scoring, capture_hash: str) -> None:
 
 def _cut_of(path: Path, content: Mapping[str, Any]) -> Cut:
     cut = content.get("cut")
-    if cut not in ("plane", "line"):
-        raise UserError(f"{path / 'scoring.json'}: cut {cut!r:.60} is neither plane nor line; {_REMEDY}")
+    if cut not in ("plane", "line", "none"):
+        raise UserError(f"{path / 'scoring.json'}: cut {cut!r:.60} is not plane, line or none; {_REMEDY}")
     return cut
 
 

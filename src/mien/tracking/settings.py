@@ -13,7 +13,7 @@ _DEVIATION = Range(5e-324, math.inf, words="a number above 0, or inf for none")
 
 LandmarkSet = Literal["mediapipe", "ibug51"]
 """All 478 landmarks, or irises and the 68 of 300-W without their contour (supplement of GaussianAvatars, section A)."""
-Cut = Literal["plane", "line"]
+Cut = Literal["plane", "line", "none"]
 """Lower end of the head in scoring masks."""
 _TEXELS = Range(16, 8192)
 """Allowed number of texels along a side of a texture."""
@@ -139,12 +139,15 @@ class TrackingSettings:
 class ScoringSettings:
     """Settings of the scoring mask: what is trained on and scored."""
 
-    cut: Literal["auto", "plane", "line"] = "auto"
+    cut: Literal["auto", "plane", "line", "none"] = "auto"
     """Lower end of the head in the masks. plane: a plane across the lower neck, which all cameras see alike; the
     projected head stays whole. line: as in the supplement of GaussianAvatars, a line in space across the base of the
-    neck, below which everything goes; for figures beside those of that protocol. auto: line for the tracking schedule
-    `paper` from landmarks, else plane. Masks are written once, so a sequence keeps its cut."""
+    neck, below which everything goes; for figures beside those of that protocol. none: the whole person, to the edge
+    of the picture. auto: none for face models with a torso, line for the tracking schedule `paper` from landmarks, else
+    plane. Masks are written once, so a sequence keeps its cut."""
 
-    def cut_after(self, tracking: TrackingSettings) -> Cut:
-        """The cut of sequences that were tracked with these settings."""
-        return self.cut if self.cut != "auto" else "line" if tracking.published else "plane"
+    def cut_after(self, tracking: TrackingSettings, *, torso: bool) -> Cut:
+        """The cut of sequences that were tracked with these settings and a face model with or without a torso."""
+        if self.cut != "auto":
+            return self.cut
+        return "none" if torso else "line" if tracking.published else "plane"

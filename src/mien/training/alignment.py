@@ -26,6 +26,7 @@ from mien.disk.files import read_tensors, write_tensors
 from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
+from mien.face.torso import has_torso, torso_pose, with_torso
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
@@ -116,7 +117,12 @@ def align(
         template, sequences, starts, known, settings, training.held_out_cameras, folder, progress, gains
     )
     tracked = [sequence.tracking.face for sequence in sequences]
-    return [steadier(*each) for each in zip(tracked, aligned, _trained(known, lengths), strict=True)]
+    steady = [steadier(*each) for each in zip(tracked, aligned, _trained(known, lengths), strict=True)]
+    if not has_torso(face_model):
+        return steady
+    # A frame alone does not tell a torso, which is smooth in the world as it was tracked.
+    pairs = zip(steady, tracked, strict=True)
+    return [with_torso(face_model, face, torso_pose(face_model, before)) for face, before in pairs]
 
 
 def steadier(tracked: FaceParams, aligned: FaceParams, trained: Bool[Tensor, " t"]) -> FaceParams:

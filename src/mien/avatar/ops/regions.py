@@ -8,6 +8,7 @@ from torch import Tensor
 
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams
+from mien.runtime.torso import TORSO, TORSO_SHIFTS
 
 _STEP = 0.1
 """Change of an input for differences, in its unit."""
@@ -68,7 +69,7 @@ def _share_of_triangles(face_model: FaceModel, *names: str) -> Float[Tensor, " v
 def vertex_motions(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, "i v 3"]:
     """How the vertices move with each input of the face, in metres per unit, around the person at rest.
 
-    The neck counts as still: it turns all below the chin, as the head's pose does.
+    Neck and torso count as still: they turn and shift all below the chin, as the head's pose does.
     """
     e, j = subject.expression.shape[1], subject.joints.shape[1]
     i = e + 3 * j
@@ -81,8 +82,11 @@ def vertex_motions(face_model: FaceModel, subject: FaceParams) -> Float[Tensor, 
     steps = _STEP * torch.eye(i).to(subject.expression)
     motions = (at(steps) - at(-steps)) / (2 * _STEP)
     for joint, name in enumerate(face_model.free_joint_names):
-        if name == "neck":
+        if name in ("neck", TORSO):
             motions[e + 3 * joint : e + 3 * joint + 3] = 0
+    for index, name in enumerate(face_model.expression_names):
+        if name in TORSO_SHIFTS:
+            motions[index] = 0
     return motions
 
 

@@ -65,7 +65,7 @@ def bake_anny() -> FaceModel:
         people = sample_people(data, topology.base_vertices, mesh.vertices, advance)
         mend_mouth(people, topology.parts)
         mend_collar(people, topology.faces)
-        weights = _identity_weights(topology)
+        weights = identity_weights(topology)
         rigid = np.where(topology.parts["head"], 1.0, 0.0)
         identity = principal_components(people, topology.mirror, rigid, weights)
         advance(status="expressions and joints")
@@ -104,7 +104,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
         region_names=REGIONS,
         face_regions=torch.from_numpy(topology.face_regions),
         identity_basis=_rounded(components),
-        expression_basis=_rounded(_expression_deltas(raw, parts)),
+        expression_basis=_rounded(expression_deltas(raw, parts)),
         expression_names=names,
         expression_bounds=_bounds(names),
         joint_template=_rounded(joints),
@@ -115,7 +115,7 @@ def _assemble(data: Path, mesh: BaseMesh, topology: HeadTopology, identity: tupl
     )
 
 
-def _identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
+def identity_weights(topology: HeadTopology) -> Float[np.ndarray, " v"]:
     """Weight of each vertex in the principal components: high where cameras see a face most."""
     weights = np.where(topology.parts["head"], 1.0, 0.2)
     ears = np.unique(topology.faces[topology.face_regions == REGIONS.index("ears")])
@@ -134,7 +134,7 @@ def _bounds(names: tuple[str, ...]) -> torch.Tensor:
     return torch.tensor([[0.0, upper(name)] for name in names])
 
 
-def _expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
+def expression_deltas(raw: dict[str, np.ndarray], parts: dict[str, np.ndarray]) -> Float[np.ndarray, "e v 3"]:
     """The source's expression deltas, without the parts that joints move."""
     deltas = np.stack(list(raw.values()))
     rigid = np.any([parts[p] for p in ("left_eye", "right_eye", "upper_teeth", "lower_teeth", "tongue")], axis=0)
@@ -161,14 +161,25 @@ def mend_mouth(people: Float[np.ndarray, "s v 3"], parts: dict[str, Bool[np.ndar
     people[:, parts["tongue"]] = tongue
 
 
-def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+def mend_collar(people: Float[np.ndarray, "s v 3"], faces: Int[np.ndarray, "f 3"], edges_below: int = 1) -> None:
     """Smooth the lower edge of the neck in place; the rings above follow like a membrane.
+
+    With three `edges_below`, these are those of a bust: the chest and the two arms.
 
     The change is linear, so identity stays linear.
     """
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
-    loop = _lowest_loop(edges[times == 1], people[..., 1].mean(0))
+    border, height = edges[times == 1], people[..., 1].mean(0)
+    for _ in range(edges_below):
+        loop = _lowest_loop(border, height)
+        _smooth_edge(people, edges, loop)
+        border = border[~np.isin(border, loop).any(1)]
+
+
+def _smooth_edge(
+    people: Float[np.ndarray, "s v 3"], edges: Int[np.ndarray, "e 2"], loop: Int[np.ndarray, " n"]
+) -> None:
     step = 0.5 * np.eye(len(loop)) + 0.25 * (np.roll(np.eye(len(loop)), 1, 1) + np.roll(np.eye(len(loop)), -1, 1))
     move = np.linalg.matrix_power(step, _ANNY_COLLAR_STEPS) - np.eye(len(loop))
     ring = np.full(people.shape[1], _ANNY_COLLAR_RINGS + 1)

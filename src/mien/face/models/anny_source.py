@@ -7,6 +7,7 @@ vertex deltas ("targets"), and reading them takes a second.
 import gzip
 import importlib.util
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,16 +116,54 @@ def macro_targets(data: Path) -> dict[tuple[str, ...], Path]:
 
 def head_controls(data: Path) -> list[Control]:
     """Return the local shape controls of the head, then MakeHuman's asymmetries, each in alphabetical order."""
-    targets = data / "mpfb2" / "targets"
-    table = json.loads((targets / "target.json").read_text(encoding="utf-8"))
-    controls = []
-    for folder in HEAD_CONTROLS:
-        for category in table[folder]["categories"]:
-            controls.extend(_controls_of(targets / folder, category))
+    targets, controls = data / "mpfb2" / "targets", _controls_in(data, HEAD_CONTROLS)
     for positive in sorted((targets / "asym").glob("asym-*-l.target.gz")):
         name = positive.name.removesuffix("-l.target.gz")
         controls.append(Control(name, positive, positive.with_name(f"{name}-r.target.gz"), "unsided"))
     return sorted(controls, key=lambda control: (control.name.startswith("asym"), control.name, control.side))
+
+
+def build_controls(data: Path) -> list[Control]:
+    """Return the local shape controls of neck, chest, shoulders and upper arms, in alphabetical order.
+
+    Those of the forearms and of the chin are left out, and shifts to one side, which no body has.
+    """
+    left_out = ("lowerarm", "trans-in-out", "neck-double")
+    found = _controls_in(data, ("neck", "torso", "arms"))
+    kept = [control for control in found if not any(part in control.name for part in left_out)]
+    return sorted(kept, key=lambda control: (control.name, control.side))
+
+
+def joint_cubes(data: Path) -> dict[str, Int[np.ndarray, " n"]]:
+    """Return the vertices of the base mesh whose mean is a joint of the body, by the joint's name (`l-shoulder`)."""
+    text = (data / "mpfb2" / "mesh_metadata" / "basemesh_vertex_groups.json").read_text(encoding="utf-8")
+    groups = {name: spans for name, spans in json.loads(text).items() if name.startswith("joint-")}
+    return {
+        name.removeprefix("joint-"): np.concatenate([np.arange(first, last + 1) for first, last in spans])
+        for name, spans in groups.items()
+    }
+
+
+def bone_weights(data: Path, vertices: int) -> dict[str, Float[np.ndarray, " v"]]:
+    """Return the skinning weights of the body's bones, by name (`upperarm01.L`)."""
+    file = data / "mpfb2" / "rigs" / "standard" / "weights.default.json"
+    weights = {}
+    for name, rows in json.loads(file.read_text(encoding="utf-8"))["weights"].items():
+        weights[name] = np.zeros(vertices)
+        index, values = np.array(rows).reshape(-1, 2).T
+        weights[name][index.astype(np.int64)] = values
+    return weights
+
+
+def _controls_in(data: Path, folders: Sequence[str]) -> list[Control]:
+    targets = data / "mpfb2" / "targets"
+    table = json.loads((targets / "target.json").read_text(encoding="utf-8"))
+    return [
+        one
+        for folder in folders
+        for kind in table[folder]["categories"]
+        for one in _controls_of(targets / folder, kind)
+    ]
 
 
 def _controls_of(folder: Path, category: dict) -> list[Control]:

@@ -31,6 +31,8 @@ HELPERS = {
 """Helper geometry of the base mesh that the head includes, with mien's names for it."""
 
 
+_TRUNK_ISLAND = 0.6  # coordinate in the source's texture above which the trunk's island lies. Geometry of the source
+
 # Places of the source's texture islands in mien's texture: (left, bottom, width, height). Aspect ratios are kept.
 _HEAD_BOX = (0.01, 0.47, 0.98, 0.52)
 _BOXES = {
@@ -46,6 +48,15 @@ _BOXES = {
     "left_socket": (0.64, 0.01, 0.15, 0.22),
     "right_socket": (0.48, 0.01, 0.15, 0.22),
 }
+
+
+_BUST_SCALE = 0.72
+"""Scale of the head's texture in that of the bust, whose lower strip shows neck and bust."""
+_BUST_BOX = (0.01, 0.01, 0.98, 0.26)  # the place of neck and bust in that strip, as in `_BOXES`
+_BUST_BOTTOM = 0.30
+"""Height of the lower end of the bust in metres of the base mesh with its arms lowered: 43 cm below the eyes."""
+BUST_REGIONS = (*REGIONS, "bust")
+"""Region names of the bust: those of the head, in its order, and `bust` for everything below the head's mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +100,57 @@ def cut_head(data: Path, mesh: BaseMesh) -> HeadTopology:
         mirror=_mirror(positions),
         parts=members,
     )
+
+
+def cut_bust(data: Path, mesh: BaseMesh, head: HeadTopology, hanging: Float[np.ndarray, "n 3"]) -> HeadTopology:
+    """Cut head and bust out of the base mesh: chest, back, shoulders and most of the upper arms.
+
+    Vertices and triangles of the head come first, in its order. `hanging` are the base mesh's vertices with its arms
+    lowered, which say what is above the lower end.
+    """
+    quads, parts = _cut(mesh)
+    body = mesh.groups["body"]
+    known = {tuple(quad) for quad in quads[..., 0].tolist()}
+    trunk = mesh.uv[body[..., 1]].mean(1)[:, 1] > _TRUNK_ISLAND
+    new = np.array([tuple(quad) not in known for quad in body[..., 0].tolist()])
+    bust = body[trunk & new & (hanging[body[..., 0], 1] > _BUST_BOTTOM).all(1)]
+    triangles = np.concatenate([_triangulate(quads, mesh.vertices), _triangulate(bust, mesh.vertices)])
+    part_of = np.concatenate([parts, parts, np.full(2 * len(bust), "bust", dtype=parts.dtype)])
+    base_vertices = np.concatenate([head.base_vertices, np.setdiff1d(bust[..., 0], head.base_vertices)])
+    place = np.full(len(mesh.vertices), -1)
+    place[base_vertices] = np.arange(len(base_vertices))
+    faces = place[triangles[..., 0]]
+    base_uv, uv_faces = np.unique(triangles[..., 1], return_inverse=True)
+    uv_faces, positions, v = uv_faces.reshape(-1, 3), mesh.vertices[base_vertices], len(base_vertices)
+    members = {name: np.pad(part, (0, v - len(part))) for name, part in head.parts.items()}
+    members["bust"] = np.isin(np.arange(v), faces[part_of == "bust"])
+    regions = np.full(len(faces), BUST_REGIONS.index("bust"))
+    regions[: len(head.faces)] = head.face_regions
+    return HeadTopology(
+        base_vertices=base_vertices,
+        faces=faces,
+        uv=_pack_bust_texture(mesh.uv[base_uv], uv_faces, part_of, positions, faces),
+        uv_faces=uv_faces,
+        face_regions=regions,
+        mirror=_mirror(positions),
+        parts=members,
+    )
+
+
+def _pack_bust_texture(
+    uv: Float[np.ndarray, "u 2"],
+    uv_faces: Int[np.ndarray, "f 3"],
+    parts: np.ndarray,
+    positions: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+) -> Float[np.ndarray, "u 2"]:
+    """Return texture coordinates in which neck and bust are one island, below the head's."""
+    below = (parts == "neck") | (parts == "bust")
+    head = _pack_texture(uv, uv_faces, parts, positions, faces)
+    packed = _BUST_SCALE * head + np.array([0.0, 1 - _BUST_SCALE])
+    island = np.unique(uv_faces[below])
+    packed[island] = _fit(uv[island], _BUST_BOX)
+    return packed
 
 
 def _cut(mesh: BaseMesh) -> tuple[Int[np.ndarray, "q 4 2"], np.ndarray]:

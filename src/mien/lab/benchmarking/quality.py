@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
+from mien.face.torso import has_torso, torso_pose
 from mien.lab.benchmarking.comparing import known, markdown
 from mien.lab.synthetic.truth import Truth
 from mien.machine import exact
@@ -39,6 +40,18 @@ class Following:
 
 
 @dataclass(frozen=True)
+class TorsoErrors:
+    """Root mean squares over the tracked timesteps, of a face model with a torso."""
+
+    turn_deg: tuple[float, float, float]
+    """Errors of the torso's rotation about its axes: nod, turn and tilt, in degrees."""
+    turn_steady_deg: tuple[float, float, float]
+    """The same without their mean, in which the shape of clothes and the pose can compensate for each other."""
+    place_percent: float
+    """Error of the base of the neck in the picture, without its mean, in percent of the shoulders' width."""
+
+
+@dataclass(frozen=True)
 class TrackingErrors:
     """Means over the tracked timesteps of one sequence; None if there is nothing to measure."""
 
@@ -60,6 +73,7 @@ class TrackingErrors:
     """How the eyes' openings follow the true ones around blinks."""
     turns: Following | None = None
     """How head rotation follows the true one around fast turns."""
+    torso: "TorsoErrors | None" = None
     iris_deviation_percent: float | None = None
     """Standard deviation of the irises' distance x depth / focal length over near-frontal frames, in percent of the
     mean."""
@@ -96,6 +110,7 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
         jitter_mm=None if jitter_m is None else 1e3 * jitter_m,
         blinks=blink_following(projected, expected, truth, capture.fps),
         turns=turn_following(tracking, truth, capture.fps),
+        torso=torso_errors(tracking, capture, truth, face_model) if has_torso(face_model) else None,
         iris_deviation_percent=residual_report(capture, tracking, face_model)["iris_distance"]["deviation_percent"],
     )  # fmt: skip
 
@@ -146,6 +161,26 @@ def _rotation_errors(tracking: Tracking, truth: Truth) -> tuple[float, float]:
         for part in (difference, mean.T @ difference)
     ]
     return float(angles[0]), float(angles[1])
+
+
+def torso_errors(tracking: Tracking, capture: Capture, truth: Truth, face_model: FaceModel) -> TorsoErrors:
+    """Compare the torsos of a tracking with the shoulders that were drawn, as the first camera sees them."""
+    kept, true, found = tracking.valid, truth.torso, torso_pose(face_model, tracking.face)
+    turned = matrix_from_axis_angle(true.rotation).mT @ matrix_from_axis_angle(found.rotation)
+    off = torch.rad2deg(axis_angle_from_matrix(turned))[kept]
+    pairs = ((tracking.cameras, found), (truth.tracking.cameras, true))
+    ours, theirs = (cameras[0].project(pose.translation)[0].numpy() for cameras, pose in pairs)
+    away = torch.from_numpy(ours - crop_landmarks(theirs[:, None, None], capture)[:, 0, 0])[kept]
+    marks = face_model.landmark_positions(face_model(tracking.face), "shoulders")
+    left, _, right, _ = tracking.cameras[0].project(marks.reshape(-1, 3))[0].reshape(len(marks), 4, 2).unbind(1)
+    width = (left - right).norm(dim=1).median()
+    place = 100 * (away - away.mean(0)).square().sum(1).mean().sqrt() / width
+    return TorsoErrors(_three(off), _three(off - off.mean(0)), float(place))
+
+
+def _three(values: Float[torch.Tensor, "t 3"]) -> tuple[float, float, float]:
+    x, y, z = values.square().mean(0).sqrt().tolist()
+    return x, y, z
 
 
 def following(

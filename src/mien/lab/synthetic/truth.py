@@ -9,9 +9,13 @@ from jaxtyping import Float, Int
 
 from mien.disk.files import read_arrays, read_json, write_arrays, write_json
 from mien.disk.reading import expect_whole
+from mien.face.loading import load_face_model
+from mien.face.torso import TorsoPose
 from mien.lab.synthetic.anatomy import CHIN, EAR, FOREHEAD_TOP, Anatomy, measure_anatomy
+from mien.lab.synthetic.motion import neck_pivot, shoulder_rotation
 from mien.lab.synthetic.scene import SyntheticScene
 from mien.machine import exact
+from mien.runtime.rotation import axis_angle_from_matrix
 from mien.tracking.files import read_tracking, write_tracking
 from mien.tracking.tracking import Tracking
 
@@ -40,6 +44,16 @@ class Truth:
         """The region's vertices in world space."""
         poses = self.tracking.face.T_world_head.numpy()
         return exact.product(self.vertices, np.swapaxes(poses[:, :3, :3], 1, 2)) + poses[:, None, :3, 3]
+
+    @property
+    def torso(self) -> TorsoPose:
+        """The pose of the shoulders in the world, about the neck joint."""
+        face = self.tracking.face
+        pivot = neck_pivot(load_face_model(self.tracking.face_model), face.identity)
+        poses = face.T_world_head.numpy()
+        place = exact.product(poses[:, :3, :3], pivot[:, None])[..., 0] + poses[:, :3, 3]
+        rotation = axis_angle_from_matrix(shoulder_rotation(face.head_rotation.numpy()))
+        return TorsoPose(torch.from_numpy(rotation).float(), torch.from_numpy(place).float())
 
     @property
     def stored(self) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ _SWING_FRAMES = 4
 of beard falls from 0.104 to 0.055 mm, and footage does not change (log, "The landmark detector")."""
 
 _MIN_FRAMES = 3
-_FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+FACING = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 """T_camera_head of a head that looks towards the camera, but is placed at the camera's centre."""
 
 
@@ -81,7 +81,7 @@ def sequence_data(capture: Capture, settings: TrackingSettings) -> SequenceData:
         batch, T_world_fit = batch_of((initial_camera(capture, settings),)), None
     else:
         batch = batch_of(capture.calibration)
-        T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ _FACING
+        T_world_fit = invert_rigid(batch.viewmat[int(seen.sum(0).argmax())]) @ FACING
         batch = CameraBatch(batch.K, batch.viewmat @ T_world_fit)
     return SequenceData(views, valid, batch, capture, T_world_fit)
 
@@ -113,7 +113,7 @@ def initial_camera(capture: Capture, settings: TrackingSettings) -> Camera:
     focal_x, focal_y = focal if settings.focal is None else (settings.focal, settings.focal)
     x, y = (float(value) for value in capture.principal_point[0])
     K = torch.tensor([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, _FACING.clone(), capture.width, capture.height)
+    return Camera(K, FACING.clone(), capture.width, capture.height)
 
 
 def without_flicker(landmarks: Float[Tensor, "t c l 2"], seen: Bool[Tensor, "t c"]) -> Float[Tensor, "t c l 2"]:

@@ -11,7 +11,9 @@ from mien.capture.capture import Capture
 from mien.capture.person.backend import detector_of
 from mien.disk.reading import remove_tree
 from mien.errors import UserError
+from mien.face.loading import head_only
 from mien.face.model import FaceModel
+from mien.face.torso import has_torso
 from mien.machine.progress import say
 from mien.tracking.descent.fit import fit_by_descent
 from mien.tracking.fitting.parameters import layout_of
@@ -23,6 +25,7 @@ from mien.tracking.landmarks.outcome import as_tracking, without_turn_habits
 from mien.tracking.landmarks.problem import Problem, lenses_of
 from mien.tracking.landmarks.stages import fit_landmarks
 from mien.tracking.pipeline.held_out import StageFits, follow_held_out
+from mien.tracking.pipeline.torso import place_torsos
 from mien.tracking.pixels.outcome import with_pixels
 from mien.tracking.pixels.refine import refine_photometrically
 from mien.tracking.pixels.texture import even_light, photometric_start, unknown_texture
@@ -59,6 +62,9 @@ def track_subject(
     Held-out sequences have no part in identity, offsets of landmarks and vertices, texture, light and focal length. The
     result for `captures` has the same bytes as without them. Then only their motion is fitted (`follow_held_out`).
 
+    A face model with a torso is tracked by the head-only model that has its head, to the same bytes. Torsos are placed
+    afterwards (`place_torsos`).
+
     Args:
         captures: The sequences of one person.
         face_model: The face model.
@@ -71,6 +77,10 @@ def track_subject(
     """
     assert captures, "nothing to track"
     settings.check()
+    if has_torso(face_model):
+        head = head_only(face_model)
+        trackings = track_subject(captures, head, settings, keep, preview, held_out)
+        return place_torsos(face_model, head, [*captures, *held_out], trackings, len(captures))
     begun = keep is not None and keep.is_dir()
     try:
         return track_once(captures, face_model, settings, keep, preview, held_out)

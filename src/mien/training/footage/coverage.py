@@ -42,7 +42,8 @@ class Coverage:
     colors: Float[Tensor, "f 3"]
     """Mean colours in the pictures, 0..1; 0.5 where `seen` is 0."""
     above: Float[Tensor, " f"]
-    """1 for triangles above the cut at the neck, 0 for those below it, which nothing shows or scores; it fades."""
+    """1 for triangles above the cut at the neck, 0 for those below it, which nothing shows or scores; it fades. Without
+    a cut, the lower edge of the picture is in its place."""
 
 
 @torch.no_grad()
@@ -137,8 +138,11 @@ def _seen_colors(
     facing = smoothstep((cosine - hardly) / (well - hardly))
     inside = (grid.abs() < 1).all(-1) & (depth > 0)
     weight = cosine.clamp_min(0) ** 2 * facing * visible * smoothstep(2 * head[:, 0] - 1)
-    line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     corners, _ = camera.project(vertices)
+    if sequence.cut == "none":
+        framed = (camera.height - corners[:, 1]).clamp(0, 1)
+        return colors, torch.where(inside, weight, 0.0), framed[faces.long()].amin(1)
+    line = sequence.tracking.neck_lines[frame.timestep, frame.camera]
     # What is below the neck line in the picture, or below the cut in space, is not scored.
     in_space = (cut.heights(vertices) / _COVERAGE_CUT_SOFTNESS + 2).clamp(0, 1)
     above = torch.minimum((corners @ line[:2] + line[2]).clamp(0, 1), in_space)

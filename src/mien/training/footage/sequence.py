@@ -22,6 +22,7 @@ from mien.face.model import FaceModel
 from mien.tracking.files import check_tracking_of, read_tracking
 from mien.tracking.scoring import Scoring
 from mien.tracking.scoring_files import read_scoring
+from mien.tracking.settings import Cut
 from mien.tracking.tracking import Tracking
 from mien.training.footage.foreground import soft_colors
 from mien.training.footage.hidden import hidden_triangles
@@ -41,6 +42,8 @@ class Sequence:
     """Opacity of the pixels that count (the matte above the cut at the neck). 255 is opaque."""
     folder: Path | None = None
     """Folder that it was read from, for messages."""
+    cut: Cut = "plane"
+    """Lower end of what counts (`ScoringSettings.cut`)."""
 
     def usable(self) -> np.ndarray:
         """Bool [t, c]: the face was tracked, and was found in this picture, or the cameras are calibrated.
@@ -255,4 +258,4 @@ def sequence_of(folder: Path, scoring: Scoring) -> Sequence:
         raise UserError(
             f"{folder / 'scoring'}: does not belong to the capture beside it; delete it and run `mien track` again"
         )
-    return Sequence(folder.name, capture, tracking, scoring.masks, folder)
+    return Sequence(folder.name, capture, tracking, scoring.masks, folder, scoring.cut)

@@ -16,7 +16,9 @@ from mien.avatar.density import DensityControl
 from mien.avatar.settings import Photometric, Progress
 from mien.camera import Camera
 from mien.face.params import FaceParams
+from mien.face.torso import has_torso
 from mien.gaussians import Rendering
+from mien.machine.progress import say
 from mien.training.footage.coverage import Coverage, measure_coverage
 from mien.training.footage.filmed import with_shown_angles
 from mien.training.footage.frames import COVER, SIDE_VIEW, BatchFrame, Footage, random_at
@@ -206,6 +208,8 @@ def prepare_whole_head(
     """
     surface, model = avatar.extras.surface, avatar.face_model
     if surface is None:
+        if has_torso(model):
+            say(f"{model.name}: this method binds no Gaussians to the mesh, so the torso moves with the head")
         return None
     filled, unseen, coverage, interior = fills_sides(footage.frames, settings, bound=True), None, None, None
     if filled or surface.limited:

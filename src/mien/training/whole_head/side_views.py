@@ -97,6 +97,8 @@ class SideViews:
     """The face model's triangles without those of the neck."""
     subject: FaceParams | None = None
     """The person, for faces that are on a GPU."""
+    opacities: Float[Tensor, " f"] | None = None
+    """Opacities of the triangles of a bust that is not cut. None: it is cut at the neck."""
     held: Bool[Tensor, " f"] | None = None
     """`compared` on the device of the avatar. None for the CPU."""
 
@@ -180,8 +182,11 @@ class SideViews:
         raised = vertices + self.height[:, None] * vertex_normals(vertices, faces)
         index = rasterize_mesh(raised, faces, camera).face_index.numpy()
         drawn = np.where(index >= 0, 255, 0).astype(np.uint8)
-        matte = head_mask(drawn, camera, vertices, self.head_faces, fit_neck_cut(self.neck, vertices, up))
         triangle = np.maximum(index, 0)
+        if self.opacities is None:
+            matte = head_mask(drawn, camera, vertices, self.head_faces, fit_neck_cut(self.neck, vertices, up))
+        else:
+            matte = np.rint(drawn * self.opacities.numpy()[triangle]).astype(np.uint8)
         picture = composite(self._bytes_of_colors[triangle], matte, background)
         compared = self.compared.numpy()[triangle] & (matte > 0)
         return torch.from_numpy(picture), torch.from_numpy(matte), torch.from_numpy(compared)
@@ -225,7 +230,8 @@ def side_views_of(face_model: FaceModel, subject: FaceParams, unseen: Unseen | N
     like = model.template.new_zeros((), device="cpu", dtype=torch.float32)
     assert prior.colors is not None
     views = side_views(model.to(like), weight, prior.colors.to(like), prior.fill_height.to(like))
-    return replace(views, subject=subject.to(like))
+    opacities = None if prior.opacities is None else prior.opacities.to(like)
+    return replace(views, subject=subject.to(like), opacities=opacities)
 
 
 def _held_back(avatar: Avatar, posed: Posed, compared: Bool[Tensor, " f"]) -> Float[Tensor, ""] | float:

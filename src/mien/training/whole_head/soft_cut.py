@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mien.avatar.avatar import Avatar
+from mien.face.torso import has_torso
 from mien.gaussians import world_means
 from mien.tracking.neck_cut import NeckCut, NeckParts, fit_neck_cut
 from mien.training.footage.coverage import smoothstep
@@ -42,10 +43,11 @@ def with_soft_cut(portable: "PortableAvatar", avatar: Avatar) -> "PortableAvatar
     """The record of an avatar whose opacity fades towards the neck cut.
 
     Training and scoring cut heads off sharply, because their truth is cut off sharply. What is shown need not be. The
-    avatar's neck at rest places the cut. Records whose Gaussians have no opacities of their own stay as they are.
+    avatar's neck at rest places the cut. Records whose Gaussians have no opacities of their own stay as they are, and
+    so do those with a torso, whose end fades in training.
     """
     attributes = getattr(portable.baked, "attributes", None)
-    if attributes is None:
+    if attributes is None or has_torso(avatar.face_model):
         return portable
     shares = shares_left(avatar).double().cpu().numpy()
     opacities = shares / (1 + np.exp(-attributes.opacity_logits.astype(np.float64)))
@@ -62,6 +64,8 @@ def shares_left(avatar: Avatar) -> Float[Tensor, " n"]:
     It is computed on the CPU, and comes with the device and the dtype of the avatar.
     """
     gaussians = avatar.pose(avatar.subject).gaussians.timestep(0)
+    if has_torso(avatar.face_model):
+        return torch.ones_like(gaussians.means[:, 0])
     on_cpu = torch.zeros((), dtype=gaussians.means.dtype)
     model, rest = avatar.face_model.to(on_cpu), avatar.subject.to(on_cpu)
     vertices = model(rest)[0]

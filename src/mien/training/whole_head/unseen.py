@@ -64,6 +64,10 @@ white shines through hair. Measured on wojtek's head, 12,000 steps over white: 0
 white, and 26.4, 27.9 and 28.7 over dark blue. Growth at half the gradient, used with 1 alone, is 0.3 of it at most
 (log, 11-28)."""
 
+END = 0.04  # height over which the lower end of a bust fades, in metres
+_END_POWER = 1.5  # power of the fading share. Gaussians lie over each other, and together hide more than each alone
+_CLOTHES = 0.03  # how far clothes may stand off a bust, in metres. Set by eye
+
 _MOVING = ("lips", "eyelids", "eyes", "irises")
 """Regions that move most."""
 
@@ -139,9 +143,13 @@ def unseen_of(avatar: Avatar, footage: Footage, *, filled: bool) -> Unseen:
     model, hair, hanging = avatar.face_model, hair_height(footage), hanging_hair(footage)
     if not filled:
         return Unseen(None, SurfacePrior(hair, hanging))
-    found = measure_coverage(footage)
+    found, parts = measure_coverage(footage), head_parts(model)
     neutral = model.head_vertices(avatar.subject)[0].detach()
-    parts = head_parts(model)
+    opacities = None
+    if any(sequence.cut == "none" for sequence in footage.sequences) and bool(parts.bust.any()):
+        opacities = fading_end(model, neutral, parts.bust, found)
+        found = replace(found, above=(opacities > 0).to(opacities))
+        hanging = torch.where(parts.bust, hanging.clamp_min(_CLOTHES), hanging)
     # The mesh cannot say exactly which part of a mouth a picture shows, so no colour from there is believed.
     seen = torch.where(parts.interior, 0.0, found.seen)
     colors = complete_colors(model, neutral, seen, found.colors)
@@ -163,10 +171,25 @@ def unseen_of(avatar: Avatar, footage: Footage, *, filled: bool) -> Unseen:
     strands = filled_in & (parts.scalp | behind) & (hair > _STRANDS_LEAST_HEIGHT)
     carrier = carrier_of(model, avatar.subject, neutral, (shown > 0.5) & (found.above > 0.5) & ~filled_in)
     closed = filled_in | parts.interior
-    kinds = torch.stack([parts.neck, *parts.eyes, parts.teeth, parts.tongue, parts.mouth]).long()
+    kinds = torch.stack([parts.neck, *parts.eyes, parts.teeth, parts.tongue, parts.mouth, parts.bust]).long()
     kinds = (kinds * torch.arange(1, len(kinds) + 1)[:, None]).sum(0) - parts.scalp.long()
-    prior = SurfacePrior(hair, hanging, colors, doubt, filled_in, closed, strands, widening, kinds, carrier)
+    prior = SurfacePrior(hair, hanging, colors, doubt, filled_in, closed, strands, widening, kinds, opacities, carrier)
     return Unseen(found, prior)
+
+
+def fading_end(
+    face_model: FaceModel, vertices: Float[Tensor, "v 3"], bust: Bool[Tensor, " f"], coverage: Coverage
+) -> Float[Tensor, " f"]:
+    """Return the largest opacity of each triangle, which fades towards the lower end of a bust, and is 1 elsewhere.
+
+    The end is below what pictures show, or the mesh's own, if that is higher. The vertices are those of the neutral
+    head, in metres.
+    """
+    heights = vertices[face_model.faces.long(), 1]
+    shown = bust & (coverage.above > 0.5) & (coverage.seen > 0.5)
+    lowest = heights[shown if bool(shown.any()) else ~bust].amin() - END
+    share = smoothstep((heights.mean(1) - torch.maximum(lowest, heights.amin())) / END)
+    return torch.where(bust, share**_END_POWER, 1.0)
 
 
 def drawn_at_height(footage: Footage, height: Float[Tensor, " f"]) -> Bool[Tensor, " f"]:
