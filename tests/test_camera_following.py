@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def course(landmarks: np.ndarray) -> Course:
     return one, states
 
 
-def follower(**options: bool) -> Follower:
+def follower(**options: Any) -> Follower:
     return Follower(MODEL, MODEL.neutral(), None, np.zeros(3, np.float32), FollowOptions(**options))
 
 

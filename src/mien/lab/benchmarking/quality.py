@@ -73,10 +73,10 @@ class TrackingErrors:
     """How the eyes' openings follow the true ones around blinks."""
     turns: Following | None = None
     """How head rotation follows the true one around fast turns."""
-    torso: "TorsoErrors | None" = None
     iris_deviation_percent: float | None = None
     """Standard deviation of the irises' distance x depth / focal length over near-frontal frames, in percent of the
     mean."""
+    torso: "TorsoErrors | None" = None
 
 
 @torch.no_grad()
