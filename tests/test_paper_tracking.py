@@ -188,7 +188,8 @@ def test_the_schedule_alone_is_the_supplements():
     alone, better = TrackingSettings(schedule="paper"), TrackingSettings(schedule="paper", paper=QUICK)
     assert (alone.paper.start, alone.paper.steps, alone.paper.epochs) == ("landmarks", 50, 30)
     assert alone.paper.pass_smoothness > 0
-    found = [(one.landmark_set, ScoringSettings().cut_after(one, torso=False)) for one in (alone, better, TrackingSettings())]
+    each = (alone, better, TrackingSettings())
+    found = [(one.landmark_set, ScoringSettings().cut_after(one, torso=False)) for one in each]
     assert found == [("ibug51", "line"), ("mediapipe", "plane"), ("mediapipe", "plane")]
     assert int((landmark_weights(alone.landmark_set) > 0).sum()) == 51 + len(LEFT_IRIS + RIGHT_IRIS)
     given = replace(alone, landmarks="mediapipe"), ScoringSettings("plane")
