@@ -269,7 +269,7 @@ def test_choices_that_lead_nowhere(added, tmp_path, capsys):
     for file in (other, own, bare):
         write_npz(file, {"weights": np.zeros(3)})
     for choice, message in (
-        ("flame", r"there is no face model 'flame'; choose one of: anny, my_head, or give the path"),
+        ("flame", r"there is no face model 'flame'; choose one of: anny, anny-bust, my_head, or give the path"),
         (tmp_path / "none.npz", "no such file"), (tmp_path, "neither the name"),
         (other, r"another file has the name 'my_head', .*My Head\.npz; .* --name NAME"),
         (own, "one of mien's own"), (bare, "has no 'v_template'"),

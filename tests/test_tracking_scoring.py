@@ -267,7 +267,7 @@ def test_masks_keep_their_cut(tmp_path):
     with pytest.raises(UserError, match=r"--scoring.cut plane: .*give --scoring.cut line, or delete that folder"):
         scoring_files.check_scoring_cut(folder, "plane", "a1")
     edit_json(folder / "scoring.json", lambda content: content.update(cut="circle"))
-    refuses(r"cut 'circle' is neither plane nor line; delete the folder", scoring_files.read_scoring, folder)
+    refuses(r"cut 'circle' is not plane, line or none; delete the folder", scoring_files.read_scoring, folder)
 
 
 def test_damaged_scoring(tmp_path):
