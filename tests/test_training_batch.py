@@ -62,7 +62,7 @@ def pull_at(state: TrainingState, data: TrainingData, frame: int, name: str = "m
     """Return the gradient of the points in the first step, which begins at a frame: ten times the first moments."""
     state.step = frame
     step(state, data, SETTINGS)
-    averaged = state.avatar.extras.frames_per_step() if state.avatar.extras.apart else 1
+    averaged = state.avatar.extras.frames_per_step(0.0) if state.avatar.extras.apart else 1
     return means_moments(state, name).first / (1 - BETA1**averaged)
 
 
@@ -99,6 +99,23 @@ def test_losses_of_a_picture_are_means_and_steps_pass_every_multiple_once() -> N
 
 
 @pytest.mark.unchecked
+def test_steps_have_one_frame_late_in_a_run_and_rates_follow_their_number() -> None:
+    config = replace(BOUND, frames_per_step=2, one_frame_from=0.5)
+    state, data = new_state(config)
+    done, rates = [], []
+    while state.step < SETTINGS.steps:
+        before = state.step
+        step(state, data, SETTINGS)
+        done.append(state.step)
+        progress = Progress(before, SETTINGS.steps, frames=state.step - before)
+        rates.append(next(group.rate_at(progress) for group in state.avatar.parameter_groups() if group.name == "quats"))
+    # The step that began with 14 of 30 done is the last of two frames.
+    assert done == [*range(2, 17, 2), *range(17, 31)]
+    assert rates == pytest.approx([rates[-1] * 2**0.5] * 8 + [rates[-1]] * 14)
+    assert [GaussianAvatarsConfig().frames_at(fraction) for fraction in (0.0, 0.599, 0.6, 1.0)] == [2, 2, 1, 1]
+
+
+@pytest.mark.unchecked
 def test_frames_come_in_the_order_of_a_run_with_one_frame_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     state, data = new_state()
     assert state.density is not None
@@ -132,10 +149,10 @@ def test_many_points_mean_fewer_frames() -> None:
     store, found = state.avatar.store, []
     for count in (20, 25, 26, 60, 100, 101, 200, 500):
         store.select(torch.arange(count) % len(store))
-        found.append(state.avatar.extras.frames_per_step())
+        found.append(state.avatar.extras.frames_per_step(0.0))
     assert found == [8, 8, 7, 3, 2, 1, 1, 1]
     refuses("frames-per-step 0", replace(SMALL, frames_per_step=0).check)
-    assert [new_avatar(method).extras.frames_per_step() for method in ("gaussian_avatars", "headgas")] == [1, 1]
+    assert [new_avatar(method).extras.frames_per_step(0.0) for method in ("gaussian_avatars", "headgas")] == [1, 1]
 
 
 FILLED = replace(SETTINGS, unseen="filled", mesh="fitted")

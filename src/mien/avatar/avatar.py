@@ -4,6 +4,7 @@ A new method is one file with an `Avatar` and its settings, and one line in `mie
 a method"). Methods that stay keep their settings in a file of their own, which needs no torch.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -49,6 +50,8 @@ class ParameterGroup:
     itself, by group and name."""
     times_extent: bool = False
     """Whether the rate is multiplied by the extent of the cameras (`Progress.extent`)."""
+    times_root_frames: bool = False
+    """Whether the rate is multiplied by the root of the number of frames of a step, whose mean gradient is steadier."""
     factored: Mapping[str, FactoredGradient] = field(default_factory=dict)
     """Gradients, by the names of `tensors`, that `Tensor.grad` does not hold."""
     halvings: tuple[float, ...] = ()
@@ -65,7 +68,8 @@ class ParameterGroup:
         if progress.fraction < self.begin:
             return 0.0
         halved = 0.5 ** sum(progress.fraction >= time for time in self.halvings)
-        return self.rate.at(progress) * (progress.extent if self.times_extent else 1.0) * halved
+        rate = self.rate.at(progress) * (progress.extent if self.times_extent else 1.0) * halved
+        return rate * math.sqrt(progress.frames) if self.times_root_frames else rate
 
 
 def store_group(store: GaussianStore, name: str, rate: Rate, *, times_extent: bool = False) -> ParameterGroup:
@@ -106,8 +110,8 @@ class Extras:
 
     surface: BoundSurface | None = None
     """The surface that the Gaussians are bound to. None for methods that bind none, which train on all pixels."""
-    frames_per_step: Callable[[], int] = lambda: 1
-    """Returns the number of training frames that the next optimiser step uses."""
+    frames_per_step: Callable[[float], int] = lambda _: 1
+    """Returns the number of training frames of the next optimiser step, given the fraction of the run that is over."""
     apart: bool = False
     """Whether the frames of a step share nothing but the trained tensors, so that each may have a thread of its own."""
     pretraining: Pretraining | None = None

@@ -65,10 +65,6 @@ class Rate:
     end: Annotated[float | None, Range(1e-12, 100)] = None
     """The rate at the last step. If it is not given, the rate is constant."""
 
-    def times(self, factor: float) -> "Rate":
-        """This rate times a number."""
-        return Rate(self.start * factor, None if self.end is None else self.end * factor)
-
     def at(self, progress: Progress) -> float:
         """The rate at a step."""
         if self.end is None or self.start == 0:

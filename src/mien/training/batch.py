@@ -160,7 +160,8 @@ def coarse_steps(targets: Items[Targets], settings: TrainSettings) -> int:
 def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings) -> list[BatchFrame]:
     """The frames of the next step: as many as the avatar asks for and the run has left."""
     perceptual = state.avatar.config.photometric.perceptual
-    count, batch = max(1, min(state.avatar.extras.frames_per_step(), settings.steps - state.step)), []
+    wanted = state.avatar.extras.frames_per_step(state.step / settings.steps)
+    count, batch = max(1, min(wanted, settings.steps - state.step)), []
     for number in range(state.step, state.step + count):
         frame, _ = data.order.at(number)
         target, due = data.target(number, settings), perceptual.due(number, settings.steps)

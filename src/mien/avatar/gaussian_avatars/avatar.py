@@ -5,7 +5,6 @@ matters. Lengths and scales in the store are in units of the triangle's own scal
 Changes with the expression beside those of the mesh (`expression_rank`, `appearance`) are not part of the paper.
 """
 
-import math
 from dataclasses import replace
 from typing import Literal
 
@@ -57,7 +56,7 @@ class GaussianAvatars(Avatar):
             bases=("feature_bases", *BASES),
             penalties=lambda changes: mean_squares(changes, (config.expression_weight, APPEARANCE_WEIGHT)),
         )
-        extras = Extras(surface=surface, frames_per_step=lambda: config.frames_per_step, apart=True)
+        extras = Extras(surface=surface, frames_per_step=config.frames_at, apart=True)
         super().__init__(config, face_model, face, extras)
         like, n = face_model.template, face_model.faces.shape[0]
         trained = {
@@ -147,9 +146,7 @@ class GaussianAvatars(Avatar):
         ]
         if self.appearance is not None:
             groups += self.appearance.parameter_groups(self.store)
-        # The mean gradient of several frames is steadier than that of one, by the root of their number.
-        factor = math.sqrt(config.frames_per_step)
-        return groups if factor == 1 else [replace(group, rate=group.rate.times(factor)) for group in groups]
+        return [replace(group, times_root_frames=True) for group in groups]
 
     def density(self) -> GradientDensity:
         """Gradient-based control. Children stay on their parent's triangle; no triangle loses its last Gaussian."""

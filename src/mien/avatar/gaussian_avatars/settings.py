@@ -29,6 +29,8 @@ class GaussianAvatarsConfig(MethodConfig):
     frames_per_step: Annotated[int, Range(1, 64)] = 2
     """Number of frames of an optimiser step, each on a thread of its own. Learning rates of Gaussians grow with the
     root of it, and Adam's running means decay by frames."""
+    one_frame_from: Annotated[float, FRACTION] = 0.6
+    """Fraction of the run from which a step has one frame. Its gradients are less steady, and its details sharper."""
     photometric: Photometric = Photometric(
         alpha_weight=0.2, part_weight=1.0, perceptual=PerceptualLoss(weight=8.0, every=16)
     )
@@ -68,6 +70,10 @@ class GaussianAvatarsConfig(MethodConfig):
     """Whether Gaussians are kept flat on the mesh. Where sides are filled, they always are (`--training.unseen`)."""
     density: GradientSettings = field(default_factory=lambda: GradientSettings(grow_gradient=1e-4))
     """Density control: when and where Gaussians are added and removed."""
+
+    def frames_at(self, fraction: float) -> int:
+        """The number of frames of a step, given the fraction of the run that is over."""
+        return self.frames_per_step if fraction < self.one_frame_from else 1
 
 
 _STEPS, _ROUND, _FIRST, _RESET = 600_000, 2_000, 10_000, 60_000
@@ -126,9 +132,11 @@ PRESETS: dict[str, Differences] = {
     "draft": {
         "method": {
             "appearance": "static",
+            "one_frame_from": 1.0,
             "photometric": {"part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
         }
     },
+    "standard": {"settings": {"coarse": 0.4}},
     "paper": {"method": _PAPER, "settings": {"steps": _STEPS}},
 }
 """How presets differ from the defaults. `draft` lacks features and some losses, and is a shorter run."""

@@ -98,7 +98,7 @@ class MonoGaussianAvatar(FreePoints):
         """The radius of all points, which changes with the epoch."""
         return self._schedule().rendering_radius(progress.fraction)
 
-    def _frames_per_step(self) -> int:
+    def _frames_per_step(self, _: float) -> int:
         """Fewer than the settings' if there are many points."""
         return max(1, min(self.config.frames_per_step, self.config.points_per_step // len(self.store)))
 

@@ -57,7 +57,7 @@ class PointAvatar(FreePoints):
 
     def __init__(self, config: PointAvatarConfig, face_model: FaceModel, face: FaceParams):
         extras = Extras(
-            frames_per_step=lambda: config.frames_per_step,
+            frames_per_step=lambda _: config.frames_per_step,
             pretraining=Pretraining(config.pretraining, self.pretrain) if config.pretraining > 0 else None,
             unbaked=_UNBAKED if config.normals == "deformed" else None,
             closing=config.closing,

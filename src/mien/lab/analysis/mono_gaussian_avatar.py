@@ -130,7 +130,7 @@ def _snapshots(
 
     def watch(avatar: Avatar) -> None:
         nonlocal done
-        taken = max(1, min(avatar.extras.frames_per_step(), settings.steps - done))
+        taken = max(1, min(avatar.extras.frames_per_step(done / settings.steps), settings.steps - done))
         progress = Progress(done, settings.steps, done // len(trained), extent, taken)
         done += taken
         if progress.completes(steps):
