@@ -14,7 +14,6 @@ import torch
 
 from known import known
 from mien import _native
-from mien.avatar.gaussian_avatars.settings import GaussianAvatarsConfig
 from mien.avatar.headgas.settings import HeadGasConfig
 from mien.cli import main
 from mien.face import load_face_model

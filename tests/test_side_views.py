@@ -157,7 +157,9 @@ def test_sides_are_filled_by_themselves_if_one_camera_filmed():
         assert fills_sides(frames, replace(settings, unseen="filled"), bound=False)
         assert not fills_sides(frames, replace(settings, unseen="trained"), bound=True)
         assert not fills_sides(frames, settings, bound=False), "headgas has nothing to fill"
-    for filled, background, edges in ((True, "mixed", "cleaned"), (False, "white", "filmed")):
+    for filled, background, edges, coarse in ((True, "mixed", "cleaned", 0.4), (False, "white", "filmed", 0.0)):
+        assert resolved(TrainSettings(), filled=filled).coarse == coarse
+        assert resolved(TrainSettings(coarse=0.2), filled=filled).coarse == 0.2
         assert resolved(TrainSettings(background="auto"), filled=filled).background == background
         assert resolved(TrainSettings(background="white"), filled=filled).background == "white"
         assert resolved(TrainSettings(edges="auto"), filled=filled).edges == edges

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import distribution
@@ -24,6 +25,7 @@ from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.machine import progress, system
 from mien.machine.progress import current_stage, progress_bar, say, stages
+from mien.machine.stops import Put, Terminated
 from mien.machine.terminal import plain_name, printable, show
 from mien.machine.threads import MAX_THREADS, asked_threads, thread_count
 from mien.pipeline import stage_times, track
@@ -227,6 +229,23 @@ def test_work_beside_has_no_bar_and_its_error_is_told(monkeypatch, capsys) -> No
         advance()
     told = [line.partition(" in ")[0] for line in capsys.readouterr().err.splitlines()]
     assert sorted(told) == ["See report.html", "training: 1/1"]
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, Terminated])
+def test_work_beside_ends_when_a_command_is_stopped(kind: type[BaseException], monkeypatch) -> None:
+    asked, shown, ask = threading.Event(), [], Put.ask
+
+    def show(*_: object) -> None:
+        with progress_bar("Overlay", 2) as advance:
+            assert asked.wait(60)
+            advance()
+            shown.append("the whole film")
+
+    monkeypatch.setattr(track, "show_trackings", show)
+    monkeypatch.setattr(Put, "ask", lambda *given: ask(*given) or asked.set())
+    with pytest.raises(kind), track.showing_meanwhile(Workspace(Path()), [], "auto"):
+        raise kind
+    assert (asked.is_set(), shown) == (True, [])
 
 
 OF_PLACES = ("LANG", "LC_ALL", "LC_CTYPE", "PYTHONUTF8", "PYTHONIOENCODING", "HOME", "XDG_CACHE_HOME", "MIEN_THREADS")

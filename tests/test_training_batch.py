@@ -108,7 +108,9 @@ def test_steps_have_one_frame_late_in_a_run_and_rates_follow_their_number() -> N
         step(state, data, SETTINGS)
         done.append(state.step)
         progress = Progress(before, SETTINGS.steps, frames=state.step - before)
-        rates.append(next(group.rate_at(progress) for group in state.avatar.parameter_groups() if group.name == "quats"))
+        rates.append(
+            next(group.rate_at(progress) for group in state.avatar.parameter_groups() if group.name == "quats")
+        )
     # The step that began with 14 of 30 done is the last of two frames.
     assert done == [*range(2, 17, 2), *range(17, 31)]
     assert rates == pytest.approx([rates[-1] * 2**0.5] * 8 + [rates[-1]] * 14)

@@ -26,7 +26,7 @@ console = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 _PLAIN_INTERVAL_SECONDS = 10.0
 _beside = threading.local()
-"""Its `work` is true in threads whose work stands beside that which a person waits for."""
+"""Its `advance` is called instead of a bar's in threads whose work stands beside that which a person waits for."""
 _stage: list[str] = []
 """The name of the stage of the command that runs, if it has said so."""
 
@@ -59,15 +59,16 @@ class Advance(Protocol):
         ...
 
 
-def without_bars() -> None:
-    """Show no bars of the calling thread's work, as another thread has one."""
-    _beside.work = True
+def show_no_bars(advance: Advance) -> None:
+    """Call `advance` instead of showing bars of the calling thread's work, as another thread has one."""
+    _beside.advance = advance
 
 
 def progress_bar(title: str, total: int, completed: int = 0) -> AbstractContextManager[Advance]:
     """A bar from `completed` to `total`. If the output is no terminal, it prints a line every ten seconds instead."""
-    if getattr(_beside, "work", False):
-        return nullcontext(lambda amount=1, status="": None)
+    advance: Advance | None = getattr(_beside, "advance", None)
+    if advance is not None:
+        return nullcontext(advance)
     return (_bar if sys.stderr.isatty() else _plain_progress)(printable(title), total, completed)
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import signal
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -20,7 +21,8 @@ from mien.face.checks import check_face_params
 from mien.face.loading import load_face_model
 from mien.face.model import FaceModel
 from mien.face.torso import has_torso
-from mien.machine.progress import say, without_bars
+from mien.machine.progress import say, show_no_bars
+from mien.machine.stops import Put, Terminated
 from mien.media.video import count_frames
 from mien.pipeline.face_models import face_model_of
 from mien.tracking.files import check_tracking_of, read_tracking, write_tracking
@@ -38,11 +40,8 @@ _TRACKING_RECIPE = 12
 """Version of the tracking. It is raised whenever the same captures would be tracked differently, so that old trackings
 no longer count as current."""
 
-_DESCENT_RECIPE = "descent 4"
-"""The same for what only the schedule `paper` does."""
-
-_TORSO_RECIPE = "torso 1"
-"""The same for torsos."""
+_DESCENT_RECIPE, _TORSO_RECIPE = "descent 4", "torso 1"
+"""The same for what only the schedule `paper` does, and for torsos."""
 
 DEFAULT_SCORING = ScoringSettings()
 
@@ -114,10 +113,19 @@ def show_trackings(workspace: Workspace, names: Collection[str], overlay: Overla
 
 @contextmanager
 def showing_meanwhile(workspace: Workspace, names: Collection[str], overlay: Overlay) -> Iterator[None]:
-    """Run `show_trackings` on a thread beside the block, which ends when both have ended."""
-    with ThreadPoolExecutor(1, thread_name_prefix="mien-reports", initializer=without_bars) as pool:
+    """Run `show_trackings` on a thread beside the block, which ends when both have ended. A stop ends both."""
+    stop = Put()
+
+    def advance(amount: int = 1, status: str = "") -> None:
+        stop.follow()
+
+    with ThreadPoolExecutor(1, "mien-reports", show_no_bars, (advance,)) as pool:
         shown = pool.submit(show_trackings, workspace, names, overlay)
-        yield
+        try:
+            yield
+        except (KeyboardInterrupt, Terminated):
+            stop.ask(signal.SIGINT)
+            raise
     shown.result()
 
 

@@ -154,7 +154,7 @@ class TrainingData:
 def coarse_steps(targets: Items[Targets], settings: TrainSettings) -> int:
     """Number of steps at the start of a run whose pictures are halved: none if some of the pictures are small."""
     large = all(max(one.width, one.height) >= LEAST_HALVED for one in targets)
-    return round(settings.coarse * settings.steps) if large else 0
+    return round((settings.coarse or 0.0) * settings.steps) if large else 0
 
 
 def next_batch(state: TrainingState, data: TrainingData, settings: TrainSettings) -> list[BatchFrame]:

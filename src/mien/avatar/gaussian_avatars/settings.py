@@ -136,7 +136,6 @@ PRESETS: dict[str, Differences] = {
             "photometric": {"part_weight": 0.0, "perceptual": {"weight": 0.0, "every": 8}},
         }
     },
-    "standard": {"settings": {"coarse": 0.4}},
     "paper": {"method": _PAPER, "settings": {"steps": _STEPS}},
 }
 """How presets differ from the defaults. `draft` lacks features and some losses, and is a shorter run."""

@@ -66,9 +66,10 @@ class TrainSettings:
     run, which can show as dark spots on cheeks from the side."""
     resolution: Annotated[int, Range(16, MAX_SIDE, or_zero=True)] = 0
     """Longer side of the training pictures, in pixels. 0 keeps the capture's own. Pictures are never enlarged."""
-    coarse: Annotated[float, FRACTION] = 0.0
+    coarse: Annotated[float | None, FRACTION] = None
     """Share of the run, from its start, that trains on pictures of half that size, which takes less time. Pictures
-    whose longer side has fewer than 384 pixels are not halved."""
+    whose longer side has fewer than 384 pixels are not halved. If it is not given, 0.4 where sides are filled
+    (`--training.unseen`), else 0."""
     seed: Annotated[int, Range(-(2**63), 2**63 - 1)] = 0
     """Seed of all random numbers. The same seed, settings and data give the same bytes on a CPU."""
     device: DeviceName = "cpu"
@@ -115,8 +116,14 @@ def doubly_held_out(settings: TrainSettings) -> str | None:
     )
 
 
+_COARSE = 0.4
+"""Share of a run with filled sides that trains on halved pictures: more of it blurs hair and skin (docs/log.md)."""
+
+
 def resolved(settings: TrainSettings, *, filled: bool) -> TrainSettings:
     """The settings without `auto`: filled sides have mixed backgrounds and cleaned edges, others white and filmed."""
+    if settings.coarse is None:
+        settings = replace(settings, coarse=_COARSE if filled else 0.0)
     if settings.background == "auto":
         settings = replace(settings, background="mixed" if filled else "white")
     return replace(settings, edges="cleaned" if filled else "filmed") if settings.edges == "auto" else settings
