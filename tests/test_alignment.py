@@ -115,7 +115,7 @@ def test_what_matters_more_moves_further() -> None:
     values = torch.zeros(1, 2, requires_grad=True)
     group = ParameterGroup("face", {"face": values}, Rate(0.01), {"face": Moments.zeros(values.detach())})
     values.grad = torch.tensor([[4.0, 1.0]])
-    descend([group], {"face": 2.0})
+    descend([group], {"face": torch.tensor(2.0)})
     assert torch.allclose(values, torch.tensor([[-0.02, -0.005]]))
     assert values.grad is None
 

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from types import ModuleType
 
@@ -15,9 +16,13 @@ from mien.adam import FactoredMoments
 from mien.avatar import GaussianAvatarsConfig
 from mien.avatar.methods import METHODS
 from mien.avatar.settings import MethodConfig, Progress
+from mien.machine.progress import Advance
 from mien.training import PRESETS, TrainSettings, trainer
+from mien.training.alignment import align_faces
 from mien.training.checkpoint import TrainingState
 from mien.training.density_control import gradient, refill
+from mien.training.footage.frames import training_frames
+from mien.training.settings import AlignmentSettings
 from mien.training.whole_head import side_views
 from plain_settings import plain_config, plain_run
 from toy_scene import toy_data, toy_face, toy_sequence
@@ -170,6 +175,28 @@ def test_the_default_has_few_launches_and_side_views_at_most_twice_as_many() -> 
     assert max(plain) <= 130, counts
     assert max(with_views) <= 225, counts
     assert min(with_views) > max(plain), "side views are among them"
+
+
+@pytest.mark.unchecked
+def test_aligning_frames_waits_for_nothing() -> None:
+    """Eight steps of a frame to a fixed avatar: poses, pictures, losses and the descent stay on the GPU."""
+    face_model, sequence = toy_sequence(timesteps=3, size=32)
+    settings = plain_run(**LONG)
+    avatar = trainer.start([sequence], face_model, GaussianAvatarsConfig(), settings, META).avatar
+    waits: list[list[str]] = []
+
+    @contextmanager
+    def counted(*_: object) -> Iterator[Advance]:
+        with Constants() as constants, Launches() as launches:
+            yield lambda amount=1, status="": waits.append([*launches.waits, *constants.waits])
+
+    known = training_frames([sequence], settings)
+    with pytest.raises(NotImplementedError, match="meta"):  # where the faces are copied to the CPU
+        align_faces(
+            avatar, [sequence], [sequence.tracking.face], known, AlignmentSettings(), progress=counted, like=META
+        )
+    # What stays on a GPU is moved there with the first frame.
+    assert [own[len(waits[0]) :] for own in waits] == [[], [], []]
 
 
 def test_a_copy_that_waits_is_found() -> None:

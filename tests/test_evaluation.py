@@ -12,7 +12,7 @@ import torch
 from evaluation_case import drawn_sequence, make_experiment
 from mien.avatar.methods import DEFAULT_METHOD
 from mien.evaluation.baselines import make_baselines
-from mien.evaluation.experiment import Experiment, avatar_image, head_box, target_image
+from mien.evaluation.experiment import Experiment, avatar_image, head_box, moved, target_image
 from mien.evaluation.metrics import crop_to, psnr
 from mien.evaluation.protocols import Evaluation, EvaluationSettings, evaluate_frames, protocol_content
 from mien.evaluation.report_sections import spans
@@ -31,6 +31,14 @@ QUICK = EvaluationSettings(perceptual=False, baselines=False)
 @pytest.fixture(scope="module")
 def evaluation(experiment: Experiment) -> Evaluation:
     return evaluate_frames(experiment, EvaluationSettings())
+
+
+def test_a_copy_of_the_avatar_draws_elsewhere(experiment: Experiment) -> None:
+    """Another dtype stands for another device: faces and cameras follow the copy, and the avatar stays."""
+    frame, elsewhere = experiment.held_out_frames[0], moved(experiment, torch.zeros((), dtype=torch.float64))
+    pictures = avatar_image(experiment, frame), avatar_image(elsewhere, frame)
+    assert [picture.dtype for picture in pictures] == [torch.float32, torch.float64]
+    assert psnr(pictures[0], pictures[1].float()) > 60
 
 
 def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment) -> None:
@@ -54,8 +62,8 @@ def test_target_is_the_picture_inside_the_mask_over_white(experiment: Experiment
     # Crops from (10, 20) to (60, 80) and from (30, 5) to (110, 45) span 100 x 75 pixels. The margin is 5 % of 100.
     crops = experiment.scorings[0].crops.copy()
     crops[3, 0], crops[4, 0], crops[5, 0] = (10, 20, 50, 60), (30, 5, 80, 40), (0, 0, 400, 400)
-    moved = replace(experiment, scorings=(replace(experiment.scorings[0], crops=crops),))
-    assert head_box(moved, [Frame(0, 3, 0), Frame(0, 4, 0)]) == (5, 0, 110, 85)
+    turned = replace(experiment, scorings=(replace(experiment.scorings[0], crops=crops),))
+    assert head_box(turned, [Frame(0, 3, 0), Frame(0, 4, 0)]) == (5, 0, 110, 85)
 
 
 def test_an_avatar_that_white_shines_through_is_told_over_dark_blue() -> None:

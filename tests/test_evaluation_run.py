@@ -323,7 +323,7 @@ def test_compare_command(scored: dict[str, dict], root: Path, capsys: pytest.Cap
     printed = json.loads(capsys.readouterr().out)
     assert (printed["format"], printed["version"]) == ("mien.comparison", 1)
     assert ("novel_view", 4) in {(table["protocol"], len(table["rows"])) for table in printed["tables"]}
-    assert "http" not in (root / "compare.html").read_text()
+    assert "://" not in (root / "compare.html").read_text()
     assert main(["evaluate", "compare", str(root), str(root / "runs" / "none")]) == 2
 
 

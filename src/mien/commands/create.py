@@ -151,7 +151,9 @@ class Command:
             if settings.holds_out:
                 begin("scoring")
                 # `mien evaluate` judges the baselines by ST-LPIPS, too, which takes longer than all other scoring.
-                run_evaluation_stage(workspace, run, EvaluationSettings(perceptual_of="avatar"), again=False)
+                run_evaluation_stage(
+                    workspace, run, EvaluationSettings(perceptual_of="avatar", device=settings.device), again=False
+                )
         show_film(workspace, run)
         say(f"Done in {time.monotonic() - began:.0f} s. Stages: {times.told()}.")
         name_next_commands(workspace, run)

@@ -11,6 +11,7 @@ import tyro
 from mien.disk.config import Range
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
+from mien.machine.devices import DeviceName, check_device
 from mien.machine.terminal import show
 
 Protocol = Literal["insta", "imavatar", "nersemble", "nersemble-benchmark", "vhap", "nerface", "nerf-blendshape"]
@@ -58,6 +59,8 @@ class Run:
     beside those as tracked and corrected, never the headline. It takes longer."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
     """Number of optimiser steps of --fit-faces, for each held-out timestep."""
+    device: DeviceName = "cpu"
+    """Device that draws the avatar; auto: a GPU if there is one. --fit-faces needs the CPU."""
     resume: bool = False
     """Leave a run that was scored with the same settings as it is, unless drivers are given."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -66,6 +69,9 @@ class Run:
     def check(self) -> None:
         """Check without heavy libraries that there is such a run."""
         check_weights(self.lpips_weights)
+        check_device(self.device)
+        if self.fit_faces and self.device != "cpu":
+            raise UserError(f"--fit-faces --device {self.device}: faces are fitted on the CPU; leave out --device")
         open_workspace(self.workspace).pick_run(self.run_name)
 
     def run(self) -> None:
@@ -78,7 +84,7 @@ class Run:
             chosen["perceptual_frames"] = self.perceptual_frames
         settings = EvaluationSettings(
             perceptual=self.perceptual, pictures=self.pictures, fit_faces=self.fit_faces, fit_steps=self.fit_steps,
-            **chosen,
+            device=self.device, **chosen,
         )  # fmt: skip
         workspace = open_workspace(self.workspace)
         metrics = run_evaluation_stage(

@@ -1,7 +1,8 @@
 """The input of an evaluation: an avatar, the sequences it was trained on, and the frames it has never seen."""
 
+import copy
 from collections.abc import Sequence as Items
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from mien.avatar.avatar import Avatar
+from mien.avatar.avatar import Avatar, move_avatar
 from mien.camera import Box, Camera
 from mien.face.head_parts import part_boxes
 from mien.face.params import FaceParams
@@ -100,6 +101,13 @@ class Experiment:
         return self.faces[frame.sequence][frame.timestep]
 
 
+def moved(experiment: Experiment, like: Tensor) -> Experiment:
+    """The experiment with a copy of its avatar, which draws on the device of `like`. Pictures come back to the CPU."""
+    avatar = copy.deepcopy(experiment.avatar)
+    move_avatar(avatar, like)
+    return replace(experiment, avatar=avatar)
+
+
 def head_box(experiment: Experiment, frames: Items[Frame]) -> Box:
     """A box around the head crops of some frames, with a margin. One box for all frames keeps motion visible."""
     crops = np.array([experiment.crop(frame) for frame in frames])
@@ -152,7 +160,8 @@ def avatar_image(
 @torch.no_grad()
 def posed_avatar(experiment: Experiment, frame: Frame, face: FaceParams | None = None) -> Gaussians:
     """The avatar posed as in a frame, or by other face parameters."""
-    return experiment.avatar.pose(experiment.face(frame) if face is None else face).gaussians.timestep(0)
+    face = experiment.face(frame) if face is None else face
+    return experiment.avatar.pose(face.to(experiment.avatar.face_model.template)).gaussians.timestep(0)
 
 
 @torch.no_grad()
@@ -162,6 +171,6 @@ def drawn_image(
     """Gaussians of `posed_avatar` seen as in a frame, over a colour, clamped to 0..1."""
     color = (torch.tensor(background) / 255).to(gaussians.means)
     with drawable(f"{experiment.sequences[frame.sequence].name}, timestep {frame.timestep}", "train again"):
-        drawn = rasterize(gaussians, experiment.camera(frame), color)
+        drawn = rasterize(gaussians, experiment.camera(frame).to(color), color)
     image = experiment.lit(drawn, color, frame).image.clamp(0, 1)
     return close_holes(image, experiment.avatar.extras.closing).cpu()

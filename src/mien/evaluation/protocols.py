@@ -29,6 +29,7 @@ from mien.evaluation.experiment import (
     Experiment,
     avatar_image,
     drawn_image,
+    moved,
     posed_avatar,
     scored_on,
     target_image,
@@ -49,6 +50,7 @@ from mien.evaluation.scoring import (
     worker_threads,
 )
 from mien.face.params import FaceParams
+from mien.machine.devices import DeviceName, choose_device, like_on
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.perceptual.lpips import load_lpips
@@ -97,6 +99,8 @@ class EvaluationSettings(ScoreSettings):
     """Whether to score the avatar a third time, with expression and pose fitted to each held-out frame's picture."""
     fit_steps: Annotated[int, Range(1, 10_000)] = 20
     """Number of optimiser steps of that fit, for each timestep."""
+    device: DeviceName = "cpu"
+    """Device that draws the avatar."""
 
     @property
     def opened(self) -> bool:
@@ -227,9 +231,8 @@ def evaluate_frames(
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:
-        jobs = drawn_frames(
-            experiment, [frame for frame in frames if frame not in done], subjects, baselines, fit_steps
-        )
+        drawing = experiment if settings.device == "cpu" else moved(experiment, like_on(choose_device(settings.device)))
+        jobs = drawn_frames(drawing, [frame for frame in frames if frame not in done], subjects, baselines, fit_steps)
         for frame, row, seconds in stream_in_threads(score, jobs, threads):
             done[frame] = row, seconds
             if partial is not None:

@@ -6,10 +6,11 @@ the template, which stays as it is, looks like the picture. This is tracking: a 
 face parameters, as in every fit to pixels, and reaches no avatar and no face of another frame.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,12 +28,13 @@ from mien.errors import UserError
 from mien.face.model import FaceModel
 from mien.face.params import FaceParams, concatenate
 from mien.face.torso import has_torso, torso_pose, with_torso
+from mien.machine.devices import choose_device, like_on
 from mien.machine.parallel import stream_in_threads
 from mien.machine.progress import progress_bar
 from mien.machine.threads import one_torch_thread
 from mien.render.rasterize import rasterize_each
 from mien.training.colors import lit, read_gains
-from mien.training.footage.face_track import FaceTrack, corrected_poses, pose_corrections
+from mien.training.footage.face_track import FaceTrack, corrected_poses, pose_corrections, turns_from_mean
 from mien.training.footage.frames import Frame, evenly_spread, training_frames
 from mien.training.footage.sequence import Sequence, Target, Targets
 from mien.training.losses import photometric_loss
@@ -51,7 +53,7 @@ _ALIGNED_SHIFT = 0.3
 """Rate of the head's position in metres, as a share of that of its rotation in radians: the ratio with which training
 corrects the tracking."""
 
-_WHITE = np.full(3, 255, np.uint8)
+_WHITE, _ON_CPU = np.full(3, 255, np.uint8), torch.zeros(())
 _EPSILON = 1e-12
 """Least size of gradients, so that those of zero move nothing."""
 _TEMPLATE_GROW_GRADIENT = 2e-4
@@ -107,14 +109,14 @@ def align(
     def titled(title: str, total: int, completed: int):  # noqa: ANN202
         return progress(f"template: {title}", total, completed)
 
-    template = train(sequences, face_model, config, how, folder, titled)
-    move_avatar(template, torch.zeros(()))  # It may have been trained on a GPU.
+    template, like = train(sequences, face_model, config, how, folder, titled), like_on(choose_device(training.device))
+    move_avatar(template, like)
     lengths = [len(sequence.tracking.face) for sequence in sequences]
     starts = _split(read_face_track(folder, face_model), lengths)
     known = training_frames(sequences, how)
     gains = read_gains(folder, lengths)
     aligned = align_faces(
-        template, sequences, starts, known, settings, training.held_out_cameras, folder, progress, gains
+        template, sequences, starts, known, settings, training.held_out_cameras, folder, progress, gains, like
     )
     tracked = [sequence.tracking.face for sequence in sequences]
     steady = [steadier(*each) for each in zip(tracked, aligned, _trained(known, lengths), strict=True)]
@@ -152,24 +154,28 @@ def align_faces(
     folder: Path | None = None,
     progress: ProgressBar = progress_bar,
     gains: Items[Float[Tensor, "t 3"]] = (),
+    like: Float[Tensor, ""] = _ON_CPU,
 ) -> list[FaceParams]:
     """Return the face parameters of each sequence with which a fixed avatar looks most like the pictures.
 
     Each timestep descends on its own on L1 and SSIM, for the same number of steps (`descend`). Timesteps in which
     nothing was found, or in which a hand covers the face, get corrections from their neighbours.
     Some frames of `known`, on which the avatar was trained, say how large gradients are, and they alone say what
-    corrections of head poses share. With a folder, a stopped call continues there.
+    corrections of head poses share. With a folder, a stopped call continues there. The avatar is on the device of
+    `like`, where frames are fitted one after the other; on the CPU, each has a thread.
     """
     lengths, single = [len(face) for face in starts], all(len(one.tracking.cameras) == 1 for one in sequences)
     tuning, bounds = _tuning(single), avatar.face_model.expression_bounds
     used = torch.cat(_trained(known, lengths)).nonzero()[:, 0].tolist()
-    track = FaceTrack(concatenate(list(starts)), tuning, lengths, bounds, trained=used)
-    targets = [Targets(sequence, settings.resolution, len(sequences), cleaned=True) for sequence in sequences]
+    face = concatenate(list(starts))
+    track = FaceTrack(face.to(like), tuning, lengths, bounds, turns_from_mean(face, used), used)
+    targets = [Targets(sequence, settings.resolution, len(sequences), like, cleaned=True) for sequence in sequences]
+    gains, each = [own.to(like) for own in gains], stream_in_threads if like.is_cpu else map
     timesteps = [one for index, own in enumerate(sequences) for one in _looked_at(index, own, held_out_cameras)]
     trained = {frame[:2] for frame in known}
     judged = evenly_spread([one for one in timesteps if one[:2] in trained] or timesteps, _ALIGNED_JUDGED)
     with one_torch_thread(), frozen(avatar):
-        sizes = _sizes((_Target.of(one, track, targets, gains) for one in judged), avatar, track)
+        sizes = _sizes((_Target.of(one, track, targets, gains) for one in judged), avatar, track, each)
         indices = [track.index_of(*timestep[:2]) for timestep in timesteps]
         done = _take_up(folder, track, indices)
 
@@ -182,13 +188,13 @@ def align_faces(
 
         with progress("aligning frames", len(timesteps), done) as advance:
             waiting = (_Target.of(one, track, targets, gains) for one in timesteps[done:])
-            for _ in stream_in_threads(descended, waiting):
+            for _ in each(descended, waiting):
                 done += 1
                 if done % ALIGNED_BETWEEN == 0 or done == len(timesteps):
                     _keep(folder, track, indices[:done])
                 advance(1)
     track.steady_pose()
-    return _split(track.params().detach(), lengths)
+    return _split(track.params().detach().to(_ON_CPU), lengths)
 
 
 def _keep(folder: Path | None, track: FaceTrack, indices: list[int]) -> None:
@@ -263,7 +269,7 @@ class _Target:
 
 
 @torch.no_grad()
-def descend(groups: Items[ParameterGroup], sizes: Mapping[str, float]) -> None:
+def descend(groups: Items[ParameterGroup], sizes: Mapping[str, Float[Tensor, ""]]) -> None:
     """A step along the gradient with momentum, in units of its usual size. The gradients are cleared.
 
     `sizes` are the root mean squares of each group's gradients over coefficients and over some timesteps. Adam divides
@@ -277,10 +283,12 @@ def descend(groups: Items[ParameterGroup], sizes: Mapping[str, float]) -> None:
             state.step += 1
             state.first.lerp_(gradient, 1 - kept)
             unbiased = state.first / (1 - kept ** state.step.item())
-            tensor -= group.rate.start / max(sizes[group.name], _EPSILON) * unbiased
+            tensor -= group.rate.start / sizes[group.name].clamp_min(_EPSILON) * unbiased
 
 
-def _sizes(targets: Iterable[_Target], avatar: Avatar, track: FaceTrack) -> dict[str, float]:
+def _sizes(
+    targets: Iterable[_Target], avatar: Avatar, track: FaceTrack, each: Callable[..., Iterator[Any]]
+) -> dict[str, Float[Tensor, ""]]:
     """The sizes for `descend` at the present parameters of some timesteps."""
 
     @torch.enable_grad()
@@ -289,10 +297,10 @@ def _sizes(targets: Iterable[_Target], avatar: Avatar, track: FaceTrack) -> dict
         return {group.name: _taken(group) for group in track.parameter_groups(target.index)}
 
     found: dict[str, list[Tensor]] = {}
-    for own in stream_in_threads(gradients, targets):
-        for name, each in own.items():
-            found.setdefault(name, []).extend(each)
-    return {name: torch.stack(own).double().square().mean().sqrt().item() for name, own in found.items()}
+    for own in each(gradients, targets):
+        for name, gradient in own.items():
+            found.setdefault(name, []).extend(gradient)
+    return {name: torch.stack(own).double().square().mean().sqrt() for name, own in found.items()}
 
 
 def _taken(group: ParameterGroup) -> list[Tensor]:
