@@ -3,9 +3,10 @@
     make gpu                                                              # installs gsplat, then runs this
     python benchmarks/device.py --out out/gpu --video CLIP                # with a clip of your own
 
-The parts are the tests marked gpu, a training step of each method with 30,000 and 100,000 Gaussians, and `mien create`
-on a clip (a synthetic head if none is given) with training on the GPU. A part that fails or takes too long says so in
-the table, and the next one runs. The output of each part is in the folder.
+The parts are the tests marked gpu, a training step of each method with 30,000 and 100,000 Gaussians, `mien create` on a
+clip (a synthetic head if none is given) with the seconds of its stages, and the paper's preset of each method on that
+clip, which share the time that is left. A part that fails says so in the table, one that takes too long says how far it
+came, and the next one runs. The output of each part is in the folder, with a line of a curve every ten seconds.
 """
 
 import argparse
@@ -18,10 +19,12 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
+from mien.avatar.methods import METHODS
+
 BUDGET = 480.0
 """Seconds that all parts take together at most. gsplat's compilation is one of them."""
-_TESTS, _STEP = 180.0, 45.0
-"""Most seconds of the tests, and of a method's steps."""
+_TESTS, _STEP, _CREATE = 120.0, 30.0, 150.0
+"""Most seconds of the tests, of a method's steps and of `mien create`."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,12 @@ def runner(folder: Path) -> Run:
             try:
                 status = process.wait(seconds)
             except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+                process.terminate()  # An orderly stop says how far it came.
+                try:
+                    process.wait(10)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
                 status = 124
         return status, out.read_text(), errors.read_text()
 
@@ -73,22 +80,35 @@ def rows(run: Run, methods: tuple[str, ...], video: Path, workspace: Path, clock
     for method in methods:
         command = ["mien", "bench", "train-step", "--method", method, "--device", "cuda", "--json", "--seconds", "1.5"]
         yield measured(f"step-{method}", command, clock.left(_STEP), run, steps_in)
-    command = ["mien", "create", str(video), "--out", str(workspace), "--device", "cuda", "--preset", "draft"]
-    yield measured("create", command, clock.left(BUDGET), run, _last_line)
+    command = ["mien", "create", str(video), "--out", str(workspace), "--device", "cuda"]
+    yield measured("create", command, clock.left(_CREATE), run, _last_line, _stages)
+    published = [method for method in methods if "paper" in METHODS[method].presets]
+    for number, method in enumerate(published):
+        name = f"paper-{method}"
+        command = ["mien", "train", str(workspace), "--run", name, "--method", method, "--preset", "paper"]
+        left = clock.left(BUDGET) / (len(published) - number)
+        yield measured(name, [*command, "--device", "cuda"], left, run, _last_line, _last_step)
 
 
-def measured(name: str, command: list[str], seconds: float, run: Run, result: Callable[[str], str]) -> Row:
-    """Run one part."""
+def measured(
+    name: str,
+    command: list[str],
+    seconds: float,
+    run: Run,
+    result: Callable[[str], str],
+    told: Callable[[str], str] = lambda _: "",
+) -> Row:
+    """Run one part. The row has the `result` of its output, or what it `told` on standard error."""
     if seconds < 1:
         return Row(name, "left out: no time was left", 0.0)
     began = time.monotonic()
     status, output, errors = run(name, command, seconds)
     took = time.monotonic() - began
     if status == 124:
-        return Row(name, f"not finished after {seconds:.0f} s", took)
+        return Row(name, f"not finished after {seconds:.0f} s; {told(errors)}".rstrip("; "), took)
     if status != 0:
         return Row(name, f"failed ({status}): {_last_line(errors) or _last_line(output)}", took)
-    return Row(name, result(output), took)
+    return Row(name, told(errors) or result(output), took)
 
 
 def steps_in(output: str) -> str:
@@ -105,6 +125,16 @@ def table(machine: str, found: list[Row]) -> str:
     return "\n".join([*lines, *(f"| {row.part} | {row.result} | {row.seconds:.0f} |" for row in found)]) + "\n"
 
 
+def _stages(errors: str) -> str:
+    """The seconds of each stage of `mien create`, or the last thing that it said."""
+    return next((line for line in errors.splitlines() if line.startswith("Done in ")), _last_line(errors))
+
+
+def _last_step(errors: str) -> str:
+    """The last line of a training's curve."""
+    return _last_line("\n".join(line for line in errors.splitlines() if line.startswith("training: ")))
+
+
 def _last_line(text: str) -> str:
     lines = [line.strip().strip("=").strip() for line in text.splitlines() if line.strip()]
     return lines[-1].replace("|", "/") if lines else ""
@@ -118,7 +148,6 @@ def main() -> int:
     arguments = parser.parse_args()
     import torch
 
-    from mien.avatar.methods import METHODS
     from mien.lab.synthetic.captures import write_synthetic_video
     from mien.lab.synthetic.recipe import RECIPES
 

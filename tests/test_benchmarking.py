@@ -1,7 +1,9 @@
 """`mien bench render | train-step | scaling` writes rows, json and charts that say what was measured."""
 
+import importlib
 import itertools
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +17,7 @@ import torch
 from known import known
 from mien import _native
 from mien.avatar.headgas.settings import HeadGasConfig
+from mien.avatar.methods import METHODS
 from mien.cli import main
 from mien.face import load_face_model
 from mien.lab.benchmarking import GPU_BENCHMARKS, method_steps, scaling, step_parts, train_step
@@ -171,6 +174,35 @@ def test_what_a_gpu_would_be_measured_with_runs_in_plain_pytorch(monkeypatch: py
     assert all((row.gaussians, row.width, row.height) == (60, 24, 16) and row.min_ms > 0 for row in rows)
     if not torch.cuda.is_available():
         assert "--device cuda" in complaint(capsys, "bench", "render", "--device", "cuda")
+
+
+def test_parts_for_a_gpu_tell_how_far_they_came(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Two of the parts are stopped when their time is over, and one fails."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    device = importlib.import_module("device")
+    asked: dict[str, float] = {}
+    curve = "stage 4 of 5 (training)\ntraining: 80/600000 in 20 s; PSNR 24.1 dB\nInterrupted\n"
+    steps = {"rows": [{"name": "train_step", "gaussians": 30_000, "width": 550, "height": 802, "median_ms": 4.21}]}
+
+    def run(name: str, command: list[str], seconds: float) -> tuple[int, str, str]:
+        asked[name] = seconds
+        if name == "tests":
+            return 0, "== 31 passed in 60 s ==\n", ""
+        if name.startswith("step-"):
+            return (1, "", "out of memory\n") if "headgas" in name else (0, json.dumps(steps), "")
+        return (0, "", "Done in 99 s. Stages: a 9 s.\nNext\n") if name == "create" else (124, "", curve)
+
+    clock = device.Clock(math.inf)
+    rows = {row.part: row.result for row in device.rows(run, tuple(METHODS), tmp_path / "a.mp4", tmp_path, clock)}
+    papers = [f"paper-{name}" for name in METHODS if "paper" in METHODS[name].presets]
+    assert list(rows) == ["tests", *(f"step-{name}" for name in METHODS), "create", *papers]
+    assert (rows["tests"], rows["create"]) == ("31 passed in 60 s", "Done in 99 s. Stages: a 9 s.")
+    assert (rows["step-headgas"], rows["step-mono_gaussian_avatar"]) == (
+        "failed (1): out of memory", "30,000 at 550x802: 4.21 ms",
+    )  # fmt: skip
+    assert rows[papers[0]].endswith("s; training: 80/600000 in 20 s; PSNR 24.1 dB")
+    assert sum(asked[name] for name in asked if not name.startswith("paper-")) < device.BUDGET
+    assert asked[papers[0]] == device.BUDGET / len(papers)
 
 
 @pytest.mark.gpu

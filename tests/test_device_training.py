@@ -81,7 +81,7 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
-def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys) -> None:
+def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, tmp_path: Path, capsys) -> None:
     needs = "needs a CUDA GPU and gsplat.*uv pip install"
     for gsplat, words in ((None, needs), (object(), "torch .*nvidia-smi")):
         monkeypatch.setattr(mien.machine.devices, "find_spec", lambda name, gsplat=gsplat: gsplat)
@@ -90,6 +90,12 @@ def test_a_device_is_chosen_or_says_what_to_do(monkeypatch, no_gpu: None, capsys
     assert "using the processor" in capsys.readouterr().err
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "some GPU")
+    monkeypatch.setattr(mien.machine.devices, "find_spec", lambda name: None if name == "gsplat.csrc" else object())
+    monkeypatch.setenv("PATH", str(tmp_path))
+    refuses("--device cuda: gsplat finds no nvcc .*install the CUDA toolkit .*leave --device", choose_device, "cuda")
+    assert choose_device("auto").type == "cpu"
+    assert "--device auto: gsplat finds no nvcc to compile its kernels with; using" in capsys.readouterr().err
+    (tmp_path / "nvcc").touch(0o755)
     assert choose_device("auto").type == choose_device("cuda").type == "cuda"
     assert "some GPU: gsplat compiles its kernels at first use" in capsys.readouterr().err
 

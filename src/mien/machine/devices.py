@@ -1,5 +1,6 @@
 """The device that holds the tensors of training and rendering: the CPU, or a CUDA GPU through gsplat."""
 
+import shutil
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
@@ -32,9 +33,13 @@ def choose_device(name: DeviceName) -> "torch.device":
 
     if name == "cpu":
         return torch.device("cpu")
-    if name == "auto" and not (torch.cuda.is_available() and find_spec("gsplat") is not None):
-        say("--device auto: torch finds no CUDA GPU, or gsplat is not installed; using the processor")
-        return torch.device("cpu")
+    if name == "auto":
+        lacking = ["torch finds no CUDA GPU"] * (not torch.cuda.is_available())
+        lacking += ["gsplat is not installed"] * (find_spec("gsplat") is None)
+        lacking = lacking or ["gsplat finds no nvcc to compile its kernels with"] * (not _has_kernels())
+        if lacking:
+            say(f"--device auto: {' and '.join(lacking)}; using the processor")
+            return torch.device("cpu")
     check_device(name)
     if not torch.cuda.is_available():
         built = "is built without CUDA" if torch.version.cuda is None else f"(CUDA {torch.version.cuda}) finds no GPU"
@@ -42,8 +47,18 @@ def choose_device(name: DeviceName) -> "torch.device":
             f"--device cuda: torch {torch.__version__} {built}; check that `nvidia-smi` lists a GPU and that its "
             f"driver is new enough, {_OR_CPU}"
         )
+    if not _has_kernels():
+        raise UserError(
+            f"--device cuda: gsplat finds no nvcc to compile its kernels with; install the CUDA toolkit "
+            f"{torch.version.cuda} and put its folder bin on the PATH, {_OR_CPU}"
+        )
     say(f"{torch.cuda.get_device_name()}: gsplat compiles its kernels at first use, which takes some minutes, once")
     return torch.device("cuda")
+
+
+def _has_kernels() -> bool:
+    """Whether gsplat's kernels came with it, or can be compiled. Without nvcc it would say so in its first step."""
+    return shutil.which("nvcc") is not None or find_spec("gsplat.csrc") is not None
 
 
 def gpu_memory_mb(device: "torch.device", *, restart: bool = False) -> float:
