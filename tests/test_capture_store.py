@@ -170,7 +170,8 @@ def test_too_little_room_is_refused_before_a_picture_is_written(test_data, tmp_p
 @pytest.fixture
 def _tiny_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limit the memory of mapped pictures to a mebibyte."""
-    monkeypatch.setattr(picture_files, "MAX_KEPT_BYTES", MIB)
+    monkeypatch.setattr(picture_files, "MAX_MAPPED_BYTES", MIB)
+    monkeypatch.setattr(picture_files, "MAX_HELD_BYTES", MIB)
 
 
 def mapped_bytes() -> int:

@@ -20,8 +20,10 @@ from mien.disk.reading import open_to_read
 from mien.errors import UserError
 from mien.machine import system
 
-MAX_KEPT_BYTES = 256 << 20
-"""Number of bytes that a map hands out before it gives its pages back, and largest stack that is held in memory."""
+MAX_MAPPED_BYTES = 32 << 20
+"""Number of bytes that a map hands out before it gives its pages back."""
+MAX_HELD_BYTES = 256 << 20
+"""Size of the largest stack that is held in memory."""
 _PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)  # None if the system has no such call (Windows)
 
@@ -44,7 +46,7 @@ class PictureMap(np.memmap):
         found = super().__getitem__(index)
         if isinstance(found, np.ndarray) and self._handed_out is not None:
             self._handed_out[0] += found.nbytes
-            if self._handed_out[0] > MAX_KEPT_BYTES:
+            if self._handed_out[0] > MAX_MAPPED_BYTES:
                 self._handed_out[0] = 0
                 pages = getattr(self, "_mmap", None)
                 if pages is not None and _DONT_NEED is not None:
@@ -69,7 +71,7 @@ class PictureStack:
         """
         self._shape, self._folder = shape, folder or Path(tempfile.gettempdir())
         self._file = None
-        if math.prod(shape) <= MAX_KEPT_BYTES:
+        if math.prod(shape) <= MAX_HELD_BYTES:
             self._array = np.zeros(shape, np.uint8)
             return
         try:
