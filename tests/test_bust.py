@@ -15,6 +15,9 @@ from mien.camera import Camera
 from mien.driving.transfer import place_torso
 from mien.face import FaceModel, FaceParams, load_face_model
 from mien.face.torso import TorsoPose, build_directions, still_torso, torso_pose, with_torso
+from mien.lab.benchmarking import torso
+from mien.lab.benchmarking.quality import torso_cells
+from mien.lab.benchmarking.torso import outline_motion
 from mien.render.mesh import rasterize_mesh
 from mien.rotation import matrix_from_axis_angle
 from mien.runtime.posing import rig_points
@@ -215,6 +218,24 @@ def test_a_torso_is_found_by_shoulders_and_clothes_without_those_that_are_wrong(
     # The points tell how it turns: the error that all frames share is left.
     assert (errors[1] - errors[1].mean(0)).norm(dim=1).max() < 1.5
     assert errors[1][:, 2].abs().max() < 1.5
+
+
+def test_the_motion_of_shoulders_under_a_turning_head_is_measured(bust, monkeypatch):
+    rest = bust.neutral(1)
+    rest.head_translation[:, 2] = -1.0
+    avatar = GaussianAvatars(plain_gaussian_avatars(), bust, rest)
+    with torch.no_grad():
+        avatar.store["opacity_logits"].fill_(4.0)
+        avatar.store["log_scales"].copy_(torch.tensor([-1.1, -4.0, -1.1]))
+    still = outline_motion(avatar, rest, CAMERA)
+    assert still is not None
+    assert still < 0.3
+    monkeypatch.setattr(torso, "still_torso", lambda model, face, like: place_torso(model, face, like, "head"))
+    assert (outline_motion(avatar, rest, CAMERA) or 0) > 1.5
+    close = replace(rest, head_translation=rest.head_translation * torch.tensor([0.0, 0.0, 0.3]))
+    assert outline_motion(avatar, close, CAMERA) is None
+    errors = torso.TorsoErrors((0.4, 1.6, 0.3), (0.1, 0.2, 0.3), 0.7)
+    assert torso_cells(errors, still)[:3] == ["0.4, 1.6, 0.3 deg", "0.1, 0.2, 0.3 deg", "0.7 %"]
 
 
 def test_driven_heads_move_on_a_torso_that_stands_follows_or_moves_along(bust):

@@ -134,6 +134,8 @@ class Quality:
     method: Annotated[str, listed_methods("Method of the avatars")] = DEFAULT_METHOD
     steps: Annotated[int, Range(0, 1_000_000_000)] = 0
     """Number of optimiser steps. 0 means each capture's own number."""
+    face_model: Literal["anny", "anny-bust"] = "anny"
+    """Face model that is tracked. With a bust, errors of torsos and the motion of shoulders are printed as well."""
     out: Path = Path("out/bench-quality")
     """Folder for the drawn captures, the workspaces and the tables."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -147,7 +149,7 @@ class Quality:
         """Run every capture through all stages, then print the table."""
         from mien.pipeline.quality import run_quality_stage
 
-        run_quality_stage(self.out, self.captures, self.method, self.steps, as_json=self.as_json)
+        run_quality_stage(self.out, self.captures, self.method, self.steps, self.face_model, as_json=self.as_json)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,9 @@ from mien.evaluation.metrics_file import protocol_means
 from mien.evaluation.protocols import EvaluationSettings
 from mien.evaluation.scoring import ScoreSettings
 from mien.face.loading import load_face_model
+from mien.face.torso import has_torso
 from mien.lab.benchmarking.quality import QualityRow, markdown_table, tracking_errors
+from mien.lab.benchmarking.torso import outline_motion
 from mien.lab.benchmarking.unfilmed import (
     PosedPictures,
     as_avatar_has_it,
@@ -46,6 +48,7 @@ from mien.media.picture_files import write_png
 from mien.pipeline.align import one_camera, run_alignment_stage
 from mien.pipeline.capture import run_capture_stage
 from mien.pipeline.evaluate import run_evaluation_stage, run_sequences
+from mien.pipeline.face_models import face_model_of
 from mien.pipeline.stage_times import FILE_NAME, StageTimes
 from mien.pipeline.track import run_tracking_stage
 from mien.pipeline.train import run_training_stage
@@ -62,7 +65,9 @@ _FORMAT, _VERSION = "mien.bench_quality", 1
 _SCORED, _PRESET = EvaluationSettings(perceptual_frames=8, video_frames=0), PRESETS["standard"]
 
 
-def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: int, *, as_json: bool) -> None:
+def run_quality_stage(
+    out: Path, captures: tuple[str, ...], method: str, steps: int, face_model: str = "anny", *, as_json: bool
+) -> None:
     """Run the reference captures and print their figures. Writes OUT/quality.json, quality.md and contact_sheet.png.
 
     References of unfilmed faces have tables and files of their own, in the workspaces of their runs.
@@ -75,7 +80,7 @@ def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: 
             if not as_json:
                 show(table)
         for reference in [one for one in references if not one.unfilmed]:
-            row, strip = _run_reference(reference, out, method, steps or reference.steps)
+            row, strip = _run_reference(reference, out, method, steps or reference.steps, face_model)
             rows.append(row)
             strips.append(strip)
             content = {"rows": [asdict(row) for row in rows]}
@@ -88,7 +93,9 @@ def run_quality_stage(out: Path, captures: tuple[str, ...], method: str, steps: 
         say(f"Look at {out / 'contact_sheet.png'}; the tables are in {out / 'quality.md'}")
 
 
-def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: int) -> tuple[QualityRow, np.ndarray]:
+def _run_reference(
+    reference: ReferenceCapture, out: Path, method: str, steps: int, face_model: str
+) -> tuple[QualityRow, np.ndarray]:
     """Run all stages on one reference capture and skip those with current results; return its row and its pictures.
 
     Frames of one camera are aligned as `mien create` does.
@@ -96,7 +103,7 @@ def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: i
     drawn, workspace = out / "drawn" / reference.name, Workspace(out / reference.name)
     times = StageTimes(workspace.root / FILE_NAME)
     say(f"== {reference.name}: {reference.description}")
-    key, trackings = draw_and_track(reference, drawn, workspace, times)
+    key, trackings = draw_and_track(reference, drawn, workspace, times, face_model)
     names, run = list(trackings), f"{method}-{steps}"
     settings = reference_settings(reference, replace(_PRESET.settings_of(method), steps=steps))
     alignment = AlignmentSettings()
@@ -122,14 +129,19 @@ def _run_reference(reference: ReferenceCapture, out: Path, method: str, steps: i
             true = _workspace_of_truth(drawn, workspace, Workspace(out / f"{reference.name}-true"), names)
             run_training_stage(true, names, run, _PRESET.config(method), settings)
             by_truth = score_unseen_views(reference, drawn, true, run)
+    outline = None
+    if has_torso(face_model_of(face_model)):
+        experiment = _experiment(workspace, run)
+        frame = experiment.held_out_frames[0]
+        outline = outline_motion(experiment.avatar, experiment.face(frame), experiment.camera(frame))
     gaussians = read_training_summary(workspace.run_dir(run))["gaussians"]
     seconds, means = times.seconds(), protocol_means(metrics)
-    row = QualityRow(reference.name, key, method, steps, gaussians, means, errors, seconds, unseen, by_truth)
+    row = QualityRow(reference.name, key, method, steps, gaussians, means, errors, seconds, unseen, by_truth, outline)
     return row, _strip(workspace, run)
 
 
 def draw_and_track(
-    reference: ReferenceCapture, drawn: Path, workspace: Workspace, times: StageTimes
+    reference: ReferenceCapture, drawn: Path, workspace: Workspace, times: StageTimes, face_model: str = "anny"
 ) -> tuple[str, dict[str, Tracking]]:
     """Draw, capture and track a reference capture, and skip stages with current results.
 
@@ -140,7 +152,7 @@ def draw_and_track(
     with times.measured("capture"):
         _capture(reference, drawn, workspace)
     with times.measured("track"):
-        return key, run_tracking_stage(workspace, "anny", TrackingSettings(), overlay="none")
+        return key, run_tracking_stage(workspace, face_model, TrackingSettings(), overlay="none")
 
 
 def _capture(reference: ReferenceCapture, drawn: Path, workspace: Workspace) -> None:
@@ -219,7 +231,7 @@ def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Work
     file = run_dir / "unseen_view.json"
     if file.is_file():
         return read_json(file, "mien.unseen_view", 1, remedy=f"delete {file} and run the same command again")["angles"]
-    experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
+    experiment = _experiment(workspace, run)
     capture, truth = read_capture(drawn / views.name / "capture"), read_truth(drawn / views.name / "truth")
     moments = tuple(views.first + views.every * index for index in range(capture.timesteps))
     figures, sheet = score_side_views(
@@ -229,6 +241,12 @@ def score_unseen_views(reference: ReferenceCapture, drawn: Path, workspace: Work
     write_unseen_chart(run_dir / "unseen_view_chart.svg", figures)
     write_json(file, "mien.unseen_view", 1, {"angles": figures})
     return figures
+
+
+def _experiment(workspace: Workspace, run: str) -> Experiment:
+    """The first experiment of a run."""
+    run_dir = workspace.run_dir(run)
+    return next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
 
 
 def _copy_capture(source: Path, folder: Path) -> None:
@@ -245,8 +263,7 @@ def _copy_capture(source: Path, folder: Path) -> None:
 @torch.no_grad()
 def _strip(workspace: Workspace, run: str) -> np.ndarray:
     """Head crops of held-out pictures in a row, above those of the avatar."""
-    run_dir = workspace.run_dir(run)
-    experiment: Experiment = next(iter(load_experiments(run_dir, run_sequences(workspace, run_dir)).values()))
+    experiment = _experiment(workspace, run)
     frames, count = experiment.held_out_frames, 6
     # Choose at random: evenly spread frames of several cameras could show one camera again and again.
     places = np.random.default_rng(0).choice(len(frames), count, replace=len(frames) < count)

@@ -192,7 +192,7 @@ def _identity(
     head: FaceModel,
     scores: Float[np.ndarray, "t i"],
     share: Float[np.ndarray, " v"],
-) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "i v 3"]]:
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "k v 3"]]:
     """Return mean and directions: how the body follows the head's coefficients, then the build, which moves no head."""
     people = np.concatenate([bodies, bodies[:, topology.mirror] * np.array([-1.0, 1.0, 1.0])])
     reference = np.zeros(people.shape[1:])

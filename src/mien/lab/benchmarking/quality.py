@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float
 
 from mien.capture.capture import Capture
 from mien.face.model import FaceModel
-from mien.face.torso import has_torso, torso_pose
+from mien.face.torso import has_torso
 from mien.lab.benchmarking.comparing import known, markdown
+from mien.lab.benchmarking.torso import TorsoErrors, crop_landmarks, torso_errors
 from mien.lab.synthetic.truth import Truth
 from mien.machine import exact
 from mien.rotation import align_centered, axis_angle_from_matrix, matrix_from_axis_angle
@@ -37,18 +38,6 @@ class Following:
     loss_percent: float
     """Lost amplitude: 100 (1 - g), where the tracked signal is about g times the delayed true one."""
     events: int
-
-
-@dataclass(frozen=True)
-class TorsoErrors:
-    """Root mean squares over the tracked timesteps, of a face model with a torso."""
-
-    turn_deg: tuple[float, float, float]
-    """Errors of the torso's rotation about its axes: nod, turn and tilt, in degrees."""
-    turn_steady_deg: tuple[float, float, float]
-    """The same without their mean, in which the shape of clothes and the pose can compensate for each other."""
-    place_percent: float
-    """Error of the base of the neck in the picture, without its mean, in percent of the shoulders' width."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +65,7 @@ class TrackingErrors:
     iris_deviation_percent: float | None = None
     """Standard deviation of the irises' distance x depth / focal length over near-frontal frames, in percent of the
     mean."""
-    torso: "TorsoErrors | None" = None
+    torso: TorsoErrors | None = None
 
 
 @torch.no_grad()
@@ -113,15 +102,6 @@ def tracking_errors(tracking: Tracking, capture: Capture, truth: Truth, face_mod
         torso=torso_errors(tracking, capture, truth, face_model) if has_torso(face_model) else None,
         iris_deviation_percent=residual_report(capture, tracking, face_model)["iris_distance"]["deviation_percent"],
     )  # fmt: skip
-
-
-def crop_landmarks(landmarks: Float[np.ndarray, "t c l 2"], capture: Capture) -> Float[np.ndarray, "t c l 2"]:
-    """Convert pixels of the drawn pictures to pixels of the capture, which may be cropped and shrunk."""
-    crop = capture.source.get("crop")
-    if crop is None:
-        return landmarks
-    scale = np.array([capture.width / crop["width"], capture.height / crop["height"]], np.float32)
-    return (landmarks - np.array([crop["left"], crop["top"]], np.float32)) * scale
 
 
 def aligned_distance(points: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], rigid: bool = False) -> float:
@@ -161,26 +141,6 @@ def _rotation_errors(tracking: Tracking, truth: Truth) -> tuple[float, float]:
         for part in (difference, mean.T @ difference)
     ]
     return float(angles[0]), float(angles[1])
-
-
-def torso_errors(tracking: Tracking, capture: Capture, truth: Truth, face_model: FaceModel) -> TorsoErrors:
-    """Compare the torsos of a tracking with the shoulders that were drawn, as the first camera sees them."""
-    kept, true, found = tracking.valid, truth.torso, torso_pose(face_model, tracking.face)
-    turned = matrix_from_axis_angle(true.rotation).mT @ matrix_from_axis_angle(found.rotation)
-    off = torch.rad2deg(axis_angle_from_matrix(turned))[kept]
-    pairs = ((tracking.cameras, found), (truth.tracking.cameras, true))
-    ours, theirs = (cameras[0].project(pose.translation)[0].numpy() for cameras, pose in pairs)
-    away = torch.from_numpy(ours - crop_landmarks(theirs[:, None, None], capture)[:, 0, 0])[kept]
-    marks = face_model.landmark_positions(face_model(tracking.face), "shoulders")
-    left, _, right, _ = tracking.cameras[0].project(marks.reshape(-1, 3))[0].reshape(len(marks), 4, 2).unbind(1)
-    width = (left - right).norm(dim=1).median()
-    place = 100 * (away - away.mean(0)).square().sum(1).mean().sqrt() / width
-    return TorsoErrors(_three(off), _three(off - off.mean(0)), float(place))
-
-
-def _three(values: Float[torch.Tensor, "t 3"]) -> tuple[float, float, float]:
-    x, y, z = values.square().mean(0).sqrt().tolist()
-    return x, y, z
 
 
 def following(
@@ -310,6 +270,8 @@ class QualityRow:
     """Figures by angle (`mien.lab.benchmarking.unseen_views`). Empty if the capture has no pictures from the side."""
     unseen_views_by_truth: dict[str, Any] = field(default_factory=dict)
     """The same for a run that was trained and posed by the true tracking, which leaves what the avatar itself costs."""
+    outline_px: float | None = None
+    """Motion of the shoulders' outline (`outline_motion`). None without a torso."""
 
 
 def markdown_table(rows: list[QualityRow]) -> str:
@@ -330,6 +292,14 @@ def markdown_table(rows: list[QualityRow]) -> str:
             [(row.capture, name, *tracking_cells(errors)) for row in rows for name, errors in row.tracking.items()],
         ),
     ]  # fmt: skip
+    torsos = [(row, name, errors.torso) for row in rows for name, errors in row.tracking.items() if errors.torso]
+    if torsos:
+        heads = (
+            "capture", "sequence", "torso: nod, turn, tilt", "without their mean",
+            "place without its mean, of the width", "shoulders' outline while the head turns",
+        )  # fmt: skip
+        cells = [(row.capture, name, *torso_cells(own, row.outline_px)) for row, name, own in torsos]
+        tables.append(markdown(heads, cells))
     for row in rows:
         views = {row.capture: row.unseen_views, f"{row.capture}, true tracking": row.unseen_views_by_truth}
         tables += [unseen_table(name, figures) for name, figures in views.items() if figures]
@@ -367,6 +337,13 @@ def tracking_cells(errors: TrackingErrors) -> list[str]:
         ),
         known(errors.iris_deviation_percent, "{:.2f} %"),
     ]  # fmt: skip
+
+
+def torso_cells(errors: TorsoErrors, outline_px: float | None) -> list[str]:
+    """Return the figures of one sequence's torso as cells of a table."""
+    turns = (errors.turn_deg, errors.turn_steady_deg)
+    cells = [", ".join(f"{angle:.1f}" for angle in each) + " deg" for each in turns]
+    return [*cells, f"{errors.place_percent:.1f} %", known(outline_px, "{:.2f} px")]
 
 
 def _figures(entry: dict[str, Any]) -> str:
