@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mien import _native
 from mien.avatar.avatar import frozen
 from mien.avatar.settings import FaceTuning, Progress
 from mien.disk.config import Range
@@ -228,6 +229,8 @@ def evaluate_frames(
         if clothes is not None:
             bare = {UNCLOTHED: without(pictures[OPENED], clothes)}
             scores |= score_pictures(bare, without(truth, clothes), crop, judges[0], parts, judges[1], border)
+        if frame in perceptual_frames:
+            _native.release_memory()  # Maps of features leave holes, which would add up over the frames.
         return frame, scores, seconds
 
     with progress_bar(title, len(frames), len(done)) as advance:

@@ -22,7 +22,7 @@ from mien.machine import system
 
 MAX_MAPPED_BYTES = 32 << 20
 """Number of bytes that a map hands out before it gives its pages back."""
-MAX_HELD_BYTES = 256 << 20
+MAX_HELD_BYTES = 64 << 20
 """Size of the largest stack that is held in memory."""
 _PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _DONT_NEED = getattr(mmap, "MADV_DONTNEED", None)  # None if the system has no such call (Windows)
