@@ -20,11 +20,12 @@ import pytest
 pytest.importorskip("starlette")
 
 from mien import runtime
+from mien.batch.progress import Stage
 from mien.cli import main
 from mien.disk.files import write_arrays, write_json
 from mien.studio import people as people_on_disk
 from mien.studio.advice import advice, advice_for
-from mien.studio.making import Maker, Settings
+from mien.studio.making import Maker, Pace, Settings
 from mien.studio.people import FullError, People
 from mien.studio.server import Serving
 from mien.studio.taking import TAKINGS
@@ -227,7 +228,7 @@ def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) ->
     for name in ("Ada", "Bob", "Bad"):
         give_film(people, name, film)
     for name in ("Ada", "Bob"):
-        chosen = {"quality": "draft", "threads": 1, "method": "headgas", "keep_film": name == "Bob"}
+        chosen = {"quality": "draft", "threads": 1, "method": "headgas", "shoulders": True, "keep_film": name == "Bob"}
         assert told(serving, "POST", f"{person(name)}/making", chosen)[0] == 200
     assert told(serving, "POST", f"{person('Bob')}/making", {})[0] == 400, "it waits already"
     until(lambda: (told(serving, "GET", person("Ada"))[1]["progress"]["stage"] or {}).get("percent") == 20)
@@ -239,7 +240,13 @@ def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) ->
     until(lambda: state_of(serving, "Bob") == "making")
     assert told(serving, "POST", f"{person('Ada')}/making", shown["settings"])[0] == 200
     log = (people.root / ".studio" / "logs" / "Ada.log").read_text()
-    for words in ("'--preset', 'draft'", "'--method', 'headgas'", "'--run', 'draft_headgas_1'", "film_1.mp4"):
+    for words in (
+        "'--preset', 'draft'",
+        "'--method', 'headgas'",
+        "'--run', 'draft_headgas_1_shoulders'",
+        "anny-bust",
+        "film_1.mp4",
+    ):
         assert words in log
     (people.root / ".studio" / "go").touch()
     until(lambda: state_of(serving, "Ada") == "done")
@@ -251,6 +258,16 @@ def test_one_is_made_at_a_time_and_a_stop_stops(serving: Serving, film: Path) ->
     assert told(serving, "DELETE", person("Bob"))[0] == 200
     assert told(serving, "GET", person("Bob"))[0] == 404
     assert not [path for path in people.root.rglob("*") if "Bob" in path.name]
+
+
+def test_time_left_counts_from_the_first_stage() -> None:
+    """A process that has not said its stage has done nothing."""
+    pace = Pace("draft", None, (0.0, 0.0))
+    assert pace.seconds_left(Stage("", 0, 0, None), 1.0) is None
+    assert pace.seconds_left(Stage("capture", 1, 5, 100), 29.0) is None
+    assert pace.seconds_left(Stage("training", 4, 5, 50), 100.0) == pytest.approx(47, abs=3)
+    # It does not go back where a stage has a second bar.
+    assert pace.seconds_left(Stage("training", 4, 5, 10), 100.0) == pytest.approx(47, abs=3)
 
 
 KILLED = """

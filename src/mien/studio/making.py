@@ -17,6 +17,7 @@ from mien.batch.plan import Batch, Options, Row, State, with_fingerprint
 from mien.batch.progress import Stage, stage_of
 from mien.batch.row import attempt, stop_attempts
 from mien.disk.config import decode
+from mien.disk.reading import remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
 from mien.machine.terminal import tell
@@ -31,6 +32,7 @@ _TRAININGS = {"draft": 190, "fine": 560}
 _KNOWN_SHARE, _KNOWN_SECONDS = 0.04, 30.0
 """How much of the work, and how long, this attempt must have taken before its own pace says how long the rest takes."""
 _MOST_THREADS = 256
+_SHOULDERS = ("--face-model", "anny-bust")
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Settings:
 
     quality: str = "standard"
     method: str = DEFAULT_METHOD
+    shoulders: bool = False
     threads: int = 0
     """Threads of the computation; 0 takes all."""
     keep_film: bool = True
@@ -73,7 +76,7 @@ class Progress:
     """How many others are made first."""
 
 
-class _Pace:
+class Pace:
     """How fast the work of an attempt goes."""
 
     def __init__(self, quality: str, usual: float | None, began: tuple[float, float] | None) -> None:
@@ -86,7 +89,7 @@ class _Pace:
     def seconds_left(self, stage: Stage | None, now: float) -> int | None:
         """Seconds until the end; None if that is not known yet. What was done in earlier attempts says nothing."""
         whole, names = sum(self._shares.values()), list(self._shares)
-        if stage is not None and stage.name in names:
+        if stage is not None and stage.name and stage.name in names:
             before = sum(self._shares[name] for name in names[: names.index(stage.name)])
             now_done = before + self._shares[stage.name] * (stage.percent or 0) / 100
             # A stage has several bars, so its percentage goes back to 0.
@@ -109,7 +112,7 @@ class Maker:
         self._change, self._wake = threading.Lock(), threading.Event()
         self._running: str | None = None
         self._printed = 0  # bytes of the log before this attempt
-        self._pace: _Pace | None = None
+        self._pace: Pace | None = None
         self._ended = False
         if not (self.batch.root / "plan.json").is_file():
             self.batch.write_plan([])
@@ -135,6 +138,9 @@ class Maker:
         if not films:
             raise UserError(f"{name}: there is no film yet; film first")
         row = self._row(name, films, settings)
+        if Settings.of(self.people.read(name).get("settings", {})).shoulders != settings.shoulders:
+            for masks in self.people.folder(name).glob("sequences/*/scoring"):
+                remove_tree(masks)  # An avatar with shoulders is scored on other pixels.
         self.people.write(name, settings=asdict(settings))
         with self._change:
             if any(each.name == name for each in self._queue):
@@ -189,10 +195,10 @@ class Maker:
         paths = [folder / "films" / film for film in films]
         # A run keeps its settings and sequences, so others make another run.
         numbers = "_".join(film[5:].partition(".")[0] for film in films)
-        run = f"{settings.quality}_{settings.method}_{numbers}"
+        run = f"{settings.quality}_{settings.method}_{numbers}{'_shoulders' * settings.shoulders}"
         choices = ("--preset", settings.quality, "--method", settings.method, "--run", run)
         create = ("create", *map(str, paths), "--out", str(folder), *choices)
-        create += ("--growing", str(self.growing(name).resolve()), "--preview")
+        create += ("--growing", str(self.growing(name).resolve()), "--preview", *_SHOULDERS * settings.shoulders)
         export = ("export", str(folder), "--run", run, "--out", str(folder / "me.mien"))
         return with_fingerprint(Row(name, (create, export), {"quality": settings.quality}), paths)
 
@@ -220,7 +226,7 @@ class Maker:
         self.growing(row.name).parent.mkdir(exist_ok=True)
         self.growing(row.name).unlink(missing_ok=True)
         began = None if self._printed else (time.monotonic(), 0.0)  # an earlier attempt has done a part
-        self._pace = _Pace(settings.quality, self._usual(settings.quality), began)
+        self._pace = Pace(settings.quality, self._usual(settings.quality), began)
         state = attempt(self.batch.root, self._program, settings.threads or None, row)
         with self._change:
             is_next = any(each is row for each in self._queue[:1])

@@ -91,9 +91,7 @@ class People:
     def add(self, name: str) -> None:
         """Add a person who has agreed to be filmed."""
         if not _NAME.fullmatch(name):
-            raise UserError(
-                f"{name!r:.80} cannot be the name of a folder; give up to 60 letters, digits, spaces and - ' ."
-            )
+            raise UserError(f"{name!r:.80} cannot name a folder; give up to 60 letters, digits, spaces and - ' .")
         if name.casefold() in {each.name.casefold() for each in self.root.iterdir()}:
             raise UserError(f"{name}: there is such a person or folder already; give another name, or open that one")
         if len(self.names()) >= _MOST_PEOPLE:
@@ -102,10 +100,9 @@ class People:
 
     def read(self, name: str) -> dict[str, Any]:
         """What the studio has noted of a person; empty for a workspace that it did not make, or a damaged note."""
+        path = self.folder(name) / _RECORD_FILE
         try:
-            return read_json(self.folder(name) / _RECORD_FILE, *RECORD, remedy="delete it")
-        except NotThereError:
-            raise
+            return read_json(path, *RECORD, remedy="delete it")
         except UserError:
             return {}
 
@@ -180,10 +177,10 @@ class People:
         facts = _probed(part)
         if facts is None and cut:
             raise UserError(f"{film}: its end has not come, so it cannot be read; send it again, or remove it")
+        if facts is None:
+            part.unlink(missing_ok=True)
+            raise UserError("this is no film that can be read; give one of a camera, such as .mp4 or .mov")
         try:
-            if facts is None:
-                part.unlink(missing_ok=True)
-                raise UserError("this is no film that can be read; give one of a camera, such as .mp4 or .mov")
             part.replace(part.with_name(film))
         except OSError as error:
             raise cannot_write(part, error) from None

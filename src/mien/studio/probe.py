@@ -6,9 +6,6 @@ from pathlib import Path
 
 from mien.media.video_file import open_video
 
-_LEAST_SECONDS = 1.0
-"""A picture has no duration, and a shorter film shows nothing."""
-
 
 def probe(path: Path) -> dict[str, float]:
     """Return the facts of a film whose first picture can be decoded. Other files raise an error of their reader."""
@@ -16,7 +13,7 @@ def probe(path: Path) -> dict[str, float]:
         frame = next(container.decode(stream))
         times = (packet.pts * packet.time_base for packet in container.demux(stream) if packet.pts and packet.time_base)
         seconds = max(map(float, times), default=0.0) - float(frame.time or 0.0)
-        if seconds < _LEAST_SECONDS:
+        if seconds < 1:  # A picture has no duration.
             raise ValueError(f"{seconds:.1f} s of pictures are too few")
         return {"width": frame.width, "height": frame.height, "seconds": round(seconds, 1)}
 

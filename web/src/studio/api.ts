@@ -36,6 +36,7 @@ export interface Film {
 export interface Settings {
   quality: string;
   method: string;
+  shoulders: boolean;
   threads: number;
   keep_film: boolean;
 }

@@ -35,6 +35,7 @@ export function showMaking(): void {
   find("more").dataset.of = now.whole!.name;
   find<HTMLSelectElement>("quality").value = settings.quality;
   find<HTMLSelectElement>("method").value = settings.method;
+  find<HTMLInputElement>("shoulders").checked = settings.shoulders;
   find<HTMLInputElement>("threads").value = `${settings.threads}`;
   find<HTMLInputElement>("keep").checked = settings.keep_film;
 }
@@ -42,6 +43,7 @@ export function showMaking(): void {
 export const settings = (): Settings => ({
   quality: find<HTMLSelectElement>("quality").value,
   method: find<HTMLSelectElement>("method").value,
+  shoulders: find<HTMLInputElement>("shoulders").checked,
   threads: Math.round(Number(find<HTMLInputElement>("threads").value)) || 0,
   keep_film: find<HTMLInputElement>("keep").checked,
 });
