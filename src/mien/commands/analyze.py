@@ -1,5 +1,6 @@
 """`mien analyze`: the figures of a method's paper, measured on a run."""
 
+import json
 from dataclasses import dataclass
 from inspect import cleandoc
 from pathlib import Path
@@ -7,10 +8,13 @@ from typing import Annotated
 
 import tyro
 
+from mien.disk.reading import check_subtrees
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.lab.analysis.registry import ANALYSES, Analysis, AnalysisOptions, chosen_parts
 from mien.machine.devices import DeviceName, check_device
+from mien.machine.progress import say
+from mien.machine.terminal import show
 
 
 def _about_target() -> str:
@@ -52,7 +56,6 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.disk.reading import check_subtrees
 
         self._options().check()
         check_device(self.device)
@@ -64,12 +67,8 @@ class Command:
 
     def run(self) -> None:
         """Measure the parts and write the page."""
-        import json
-
         from mien.lab.analysis.joining import join_analyses
         from mien.lab.analysis.running import run_analysis
-        from mien.machine.progress import say
-        from mien.machine.terminal import show
         from mien.pipeline.evaluate import run_sequences
 
         workspaces, contents = self._workspaces(), {}

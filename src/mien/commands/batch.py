@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
+from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, drive, shard_of
 from mien.batch.plan import Batch, Options, Row
+from mien.batch.progress import batch_progress, progress_text
+from mien.batch.store import store_of
 from mien.disk.config import Range
+from mien.disk.files import check_writable
 from mien.errors import UserError
-from mien.machine.terminal import show
+from mien.machine.progress import say
+from mien.machine.terminal import counted, show
 
 if TYPE_CHECKING:
     from mien.batch.paper import Paper
@@ -76,8 +80,6 @@ class Run:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.disk.files import check_writable
-
         for name in ("gpus", "partition", "time", "ray_address", "store"):
             if getattr(self, name) and name not in OPTIONS_OF_ENGINES[self.on]:
                 raise UserError(f"--{name.replace('_', '-')}: changes nothing for --on {self.on}; leave it out")
@@ -90,8 +92,6 @@ class Run:
         if self.store and "://" not in self.store:
             raise UserError(f"--store {self.store}: give a URL, such as s3://bucket/people or file:///mnt/people")
         if self.store:
-            from mien.batch.store import store_of
-
             store_of(self.store)
         self._program()
         if not self.table.exists():
@@ -99,12 +99,8 @@ class Run:
 
     def run(self) -> None:
         """Run the rows, and write the results."""
-        from mien.batch.drive import drive
         from mien.batch.paper import write_table
-        from mien.batch.progress import batch_progress, progress_text
         from mien.batch.results import write_results, write_wall
-        from mien.machine.progress import say
-        from mien.machine.terminal import counted
 
         batch, (rows, paper), known = Batch(self.out), self._rows(), []
         labels = dict.fromkeys(label for row in rows for label in row.labels)
@@ -174,8 +170,6 @@ class Status:
 
     def run(self) -> None:
         """Show the status."""
-        from mien.batch.progress import batch_progress, progress_text
-
         while True:
             found = batch_progress(Batch(self.folder))
             show(json.dumps(found, indent=1) if self.as_json else progress_text(found))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mien.disk.reading import check_subtrees
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.terminal import show
@@ -45,7 +46,6 @@ class Make:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.disk.reading import check_subtrees
 
         self._settings().check()
         if self.out.suffix.lower() != ".html":
