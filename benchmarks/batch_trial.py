@@ -53,7 +53,7 @@ def work(root: str, row: Row) -> State | None:
 def drive(engine: str, root: Path, address: str) -> None:
     """Be the driver."""
     batch = Batch(root)
-    options = Options(engine, _JOBS, 1, address=address)
+    options = Options(on=engine, jobs=_JOBS, threads=1, ray_address=address)
     mien.batch.drive.drive(batch, batch.read_plan(), options, partial(work, str(root.resolve())))
 
 
