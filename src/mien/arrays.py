@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.utils.dlpack import to_dlpack
 
 from mien import _native
@@ -126,28 +125,6 @@ def own_derivative(loss: Float[Tensor, ""]) -> Tensor | None:
 def times(gradient: Tensor, factor: Float[Tensor, ""]) -> Tensor:
     """The gradient times a factor; itself if that is 1. It knows `ONE` without reading it."""
     return gradient if factor is ONE or float(factor) == 1 else gradient * factor
-
-
-class _OnePass(torch.autograd.Function):
-    """`one_pass`."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor | None]]) -> Tensor:
-        loss, ctx.gradient = compute(ctx.needs_input_grad[0])
-        return loss
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
-        return times(ctx.gradient, grad_loss), None
-
-
-def one_pass(values: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor | None]]) -> Float[Tensor, ""]:
-    """A loss that is differentiable in `values`, and whose gradient is computed together with it.
-
-    `compute` returns both, the gradient if it is asked for one. Later derivatives only scale it.
-    """
-    return _OnePass.apply(values, compute)  # pyright: ignore[reportReturnType]
 
 
 def sums(first: Sequence[Tensor], second: Sequence[Tensor]) -> list[Tensor]:

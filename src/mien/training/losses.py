@@ -4,16 +4,18 @@ The photometric loss is that of Gaussian splatting: L1 and SSIM (Wang et al. 200
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from mien import _native
-from mien.arrays import is_native, native, one_pass, recycled, recycled_like, unpacked
+from mien.arrays import is_native, native, recycled, recycled_like, times, unpacked
 from mien.avatar.settings import PerceptualLoss, Photometric
 from mien.camera import Box
 from mien.gaussians import Rendering
@@ -71,7 +73,7 @@ def photometric_loss(
             loss += _add_part(part, image, target, weights, part_weight, gradient)
         return loss, gradient
 
-    return one_pass(image, compute)
+    return _one_pass(image, compute)
 
 
 def photometric_loss_reference(
@@ -107,6 +109,26 @@ def differentiable_ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor,
     covariance = product - mean_x * mean_y
     numerator = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
     return numerator / ((mean_x * mean_x + mean_y * mean_y + C1) * (variance_x + variance_y + C2))
+
+
+class _OnePass(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor | None]]) -> Tensor:
+        loss, ctx.gradient = compute(ctx.needs_input_grad[0])
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
+        return times(ctx.gradient, grad_loss), None
+
+
+def _one_pass(values: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor | None]]) -> Float[Tensor, ""]:
+    """A loss that is differentiable in `values`, and whose gradient is computed together with it.
+
+    `compute` returns both, the gradient if it is asked for one. Later derivatives only scale it.
+    """
+    return _OnePass.apply(values, compute)  # pyright: ignore[reportReturnType]
 
 
 def _add_part(
@@ -186,7 +208,7 @@ def alpha_loss(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight:
         _native.absolute_difference(values, target, weight, *filled)
         return loss, gradient
 
-    return one_pass(alpha, compute)
+    return _one_pass(alpha, compute)
 
 
 def color_loss_reference(
@@ -221,7 +243,7 @@ def color_loss(
         _native.color_difference(own, target, chosen, weight, free, *filled)
         return loss, gradient
 
-    return one_pass(image, compute)
+    return _one_pass(image, compute)
 
 
 @dataclass(frozen=True, eq=False)
