@@ -36,7 +36,6 @@ def rasterize_mesh(
 def interpolate_mesh(
     face_index: Tensor, barycentric: Tensor, attributes: Tensor, corners: Tensor, out: Tensor
 ) -> None: ...
-
 def sample_texture(texture: Tensor, uv: Tensor, out: Tensor) -> None: ...
 
 class LitSurface(NamedTuple):
