@@ -20,7 +20,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mien.batch.drive
 from batch_stub import do_stub, stub_row
@@ -50,10 +50,10 @@ def work(root: str, row: Row) -> State | None:
     return run_row(Batch(Path(root)), row, do_stub)
 
 
-def drive(engine: str, root: Path, address: str) -> None:
+def drive(engine: Literal["local", "slurm", "ray"], root: Path, address: str) -> None:
     """Be the driver."""
     batch = Batch(root)
-    options = Options(engine, _JOBS, 1, address=address)
+    options = Options(on=engine, jobs=_JOBS, threads=1, ray_address=address)
     mien.batch.drive.drive(batch, batch.read_plan(), options, partial(work, str(root.resolve())))
 
 

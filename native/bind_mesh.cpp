@@ -147,48 +147,6 @@ void sample_texture(const Image& texture, const Array<const float, nb::shape<-1,
   mien::sample_texture(view, uv.data(), static_cast<int64_t>(uv.shape(0)), out.data());
 }
 
-void sample_texture_backward(const Image& texture, const Array<const float, nb::shape<-1, 2>>& uv, const Rows& grad_out,
-                             const Grad<float>& grad_texture, const Grad<float>& grad_uv) {
-  const mien::TextureView view = texture_of(texture);
-  require(has_shape(grad_out, uv.shape(0), texture.shape(2)), "grad_out must hold one colour per point");
-  float* by_texels = data_or_null(grad_texture, texture, "grad_texture has another size");
-  float* by_uv = data_or_null(grad_uv, uv, "grad_uv has another size");
-  const nb::gil_scoped_release release;
-  mien::sample_texture_backward(view, uv.data(), static_cast<int64_t>(uv.shape(0)), grad_out.data(), by_texels, by_uv);
-}
-
-void antialias(const Group<Fragments>& fragment_group, const Points& points, const Faces& faces,
-               const Group<MeshEdges>& edge_group, const Image& image, const Array<float, nb::ndim<3>>& out) {
-  const Fragments fragments(fragment_group);
-  const MeshEdges edges(edge_group);
-  const int channels = checked_length(image.shape(2), "channels");
-  require(has_shape(image, fragments.size.height, fragments.size.width, channels) && same_shape(out, image),
-          "image and out must be of the fragments' size");
-  const nb::gil_scoped_release release;
-  const mien::ImageMesh mesh = mesh_of(points, faces);
-  thread_local std::vector<mien::Crossing> crossings;
-  mien::find_crossings(fragments.of(mesh), mesh, edges.of(mesh), crossings);
-  mien::antialias(crossings, image.data(), static_cast<int64_t>(fragments.face_index.size()), channels, out.data());
-}
-
-void antialias_backward(const Group<Fragments>& fragment_group, const Points& points, const Faces& faces,
-                        const Group<MeshEdges>& edge_group, const Image& image, const Image& grad_out,
-                        const Array<float, nb::ndim<3>>& grad_image, const PointSums& grad_points) {
-  const Fragments fragments(fragment_group);
-  const MeshEdges edge_arrays(edge_group);
-  const int channels = checked_length(image.shape(2), "channels");
-  require(has_shape(image, fragments.size.height, fragments.size.width, channels) && same_shape(grad_out, image) &&
-              same_shape(grad_image, image) && same_shape(grad_points, points),
-          "a gradient must have the shape of its array");
-  const nb::gil_scoped_release release;
-  const mien::ImageMesh mesh = mesh_of(points, faces);
-  const mien::MeshEdges edges = edge_arrays.of(mesh);
-  thread_local std::vector<mien::Crossing> crossings;
-  mien::find_crossings(fragments.of(mesh), mesh, edges, crossings);
-  mien::antialias_backward(crossings, mesh, edges, image.data(), static_cast<int64_t>(fragments.face_index.size()),
-                           channels, grad_out.data(), grad_image.data(), grad_points.data());
-}
-
 // What `mesh_loss` draws: normals at the vertices, a texture, and the light.
 struct LitSurface {
   static constexpr char kName[] = "LitSurface";
@@ -266,11 +224,6 @@ void bind_mesh(nb::module_& module) {
   module.def("interpolate_mesh", &interpolate_mesh, "face_index"_a, "barycentric"_a, "attributes"_a, "corners"_a,
              "out"_a);
   module.def("sample_texture", &sample_texture, "texture"_a, "uv"_a, "out"_a);
-  module.def("sample_texture_backward", &sample_texture_backward, "texture"_a, "uv"_a, "grad_out"_a,
-             "grad_texture"_a.none(), "grad_uv"_a.none());
-  module.def("antialias", &antialias, "fragments"_a, "points"_a, "faces"_a, "edges"_a, "image"_a, "out"_a);
-  module.def("antialias_backward", &antialias_backward, "fragments"_a, "points"_a, "faces"_a, "edges"_a, "image"_a,
-             "grad_out"_a, "grad_image"_a, "grad_points"_a);
   module.def("mesh_loss", &mesh_loss, "fragments"_a, "points"_a, "faces"_a, "edges"_a, "surface"_a, "target"_a,
              "picture"_a.none(), "gradients"_a);
 }

@@ -24,30 +24,6 @@ void sample_texture(const TextureView& texture, const float* uv, int64_t count, 
   }
 }
 
-void sample_texture_backward(const TextureView& texture, const float* uv, int64_t count, const float* grad_out,
-                             float* grad_texels, float* grad_uv) {
-  for (int64_t i = 0; i < count; ++i) {
-    const Texel texel = texel_at(texture.width, texture.height, uv[2 * i], uv[2 * i + 1]);
-    const float* from = grad_out + i * texture.channels;
-    if (grad_texels != nullptr) {
-      float weight[4];
-      texel.weights(weight);
-      for (int k = 0; k < 4; ++k) {
-        float* to = grad_texels + texel.offset(texture, k);
-        for (int c = 0; c < texture.channels; ++c) to[c] += weight[k] * from[c];
-      }
-    }
-    if (grad_uv != nullptr) {
-      const float* corner[4];
-      texel.corners(texture, corner);
-      float by_x = 0, by_y = 0;
-      for (int c = 0; c < texture.channels; ++c) texel.slopes(corner, c, from[c], by_x, by_y);
-      grad_uv[2 * i] = by_x * texel.scale_x;
-      grad_uv[2 * i + 1] = -by_y * texel.scale_y;
-    }
-  }
-}
-
 namespace {
 
 struct EdgeEnds {

@@ -32,9 +32,6 @@ struct TextureView {
 
 // Bilinear look-up, clamped at the borders; uv [n,2], out [n,c].
 void sample_texture(const TextureView& texture, const float* uv, int64_t count, float* out);
-// Adds to `grad_texels` [th,tw,c] and writes `grad_uv` [n,2]; either may be null.
-void sample_texture_backward(const TextureView& texture, const float* uv, int64_t count, const float* grad_out,
-                             float* grad_texels, float* grad_uv);
 
 // The edges of a mesh with their triangles; the second is -1 at a border. An edge is a silhouette if it is at a border,
 // or if one of its triangles faces the camera and the other does not.

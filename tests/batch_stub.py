@@ -8,6 +8,7 @@ it), `size PATH` (of a file, as the value). Commands of mien do nothing."""
 
 import fcntl
 import os
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -84,7 +85,7 @@ def tries(path: Path, name: str) -> int:
 
 
 def drive_rows(batch: Batch, rows: Sequence[Row], **options: Any) -> None:
-    drive(batch, rows, Options(**{"jobs": 2, "threads": 1, "retry": 1, "program": PROGRAM, **options}))
+    drive(batch, rows, Options(**{"jobs": 2, "threads": 1, "retry": 1, "program": shlex.join(PROGRAM), **options}))
 
 
 def drive_stubs(root: str) -> None:

@@ -41,8 +41,8 @@ def test_a_process_that_never_claims_its_row_fails_anew_each_time(tmp_path: Path
     batch, row = Batch(tmp_path), stub_row("ann")
     batch.write_plan([row])
     silent = "its process printed nothing and ended with exit code"
-    programs = (("false",), f"{silent} 1"), (("sh", "-c", "echo 'mien: no room'; exit 7"), "no room")
-    for tries, (program, told) in enumerate((*programs, (("true",), f"{silent} 0")), start=1):
+    programs = ("false", f"{silent} 1"), ("sh -c \"echo 'mien: no room'; exit 7\"", "no room"), ("true", f"{silent} 0")
+    for tries, (program, told) in enumerate(programs, start=1):
         drive_rows(batch, [row], retry=0, program=program)
         state = known(batch.read_state("ann"))
         assert (state.status, state.tries) == ("failed", tries)
@@ -71,7 +71,7 @@ def test_slurm_waits_for_the_rows_of_a_driver_that_was_killed(tmp_path: Path, mo
     task = threading.Thread(target=finish)
     task.start()
     assert held.wait(30)
-    drive_rows(batch, [row], engine="slurm")
+    drive_rows(batch, [row], on="slurm")
     assert not queued.exists()
     assert batch.is_done(row)
     task.join()

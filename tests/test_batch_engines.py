@@ -53,7 +53,7 @@ def run_with(engine: str, root: Path, rows: list, fault: object = None, **option
     thread = threading.Thread(target=fault, daemon=True) if callable(fault) else None
     if thread is not None:
         thread.start()
-    drive_rows(batch, rows, engine=engine, jobs=0, **options)
+    drive_rows(batch, rows, on=engine, jobs=0, **options)
     states = [batch.read_state(row.name) for row in rows]
     return {state.name: state.runs[0]["psnr"] for state in states if state is not None and state.status == "done"}
 
@@ -88,7 +88,7 @@ def test_ray_gives_the_figures_of_an_undisturbed_run_though_a_worker_is_killed(t
     def kill() -> None:
         os.kill(next(ancestors(wait_for_begin(tmp_path, "row1"))), signal.SIGKILL)
 
-    assert run_with("ray", tmp_path, rows_of("2"), kill, address=ray_cluster.address) == EXPECTED
+    assert run_with("ray", tmp_path, rows_of("2"), kill, ray_address=ray_cluster.address) == EXPECTED
     assert begins(tmp_path, "row1") == 2
 
 
@@ -113,14 +113,14 @@ def test_ray_rows_survive_the_loss_of_their_node(tmp_path: Path, ray_cluster: An
         for name in lost:
             (tmp_path / f"go {name}").touch()
 
-    assert run_with("ray", tmp_path, rows, kill, address=ray_cluster.address) == EXPECTED
+    assert run_with("ray", tmp_path, rows, kill, ray_address=ray_cluster.address) == EXPECTED
     assert begins(tmp_path, lost[0]) == 2
 
 
 def test_a_row_that_no_node_of_ray_can_hold_fails_alone(tmp_path: Path, ray_cluster: Any, monkeypatch: Any):
     monkeypatch.setattr("mien.batch.engines.LOOK_SECONDS", 0.5)
     monkeypatch.setattr("mien.batch.engines.PATIENCE_SECONDS", 1.0)
-    check_too_large("ray", tmp_path, "enough memory", address=ray_cluster.address)
+    check_too_large("ray", tmp_path, "enough memory", ray_address=ray_cluster.address)
 
 
 @IN_SLURM

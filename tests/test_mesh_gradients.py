@@ -1,5 +1,6 @@
 """Gradients through rasterized meshes agree with finite differences of the same operations in float64, and areas."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,14 +12,7 @@ from torch.nn.functional import grid_sample, normalize
 
 from mien.face import FaceModel
 from mien.render.mesh import MeshFragments, interpolate_reference, rasterize_mesh, sample_texture, shade
-from mien.render.mesh_gradients import (
-    LitMesh,
-    MeshEdges,
-    antialias,
-    image_points,
-    mesh_edges,
-    mesh_loss,
-)
+from mien.render.mesh_gradients import LitMesh, MeshEdges, image_points, mesh_edges, mesh_loss
 from test_mesh import camera_at
 
 
@@ -53,10 +47,6 @@ def scene() -> Scene:
     return Scene(image_points(camera, vertices), faces, rasterize_mesh(vertices, faces, camera), mesh_edges(faces))
 
 
-def loss_weights(shape: tuple[int, ...]) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-
-
 def finite_difference(function: Callable[[Tensor], Tensor], at: Tensor, step: float) -> tuple[Tensor, Tensor]:
     """Return some entries of a function's gradient and their derivatives by central differences."""
     flat = at.double().flatten()
@@ -84,39 +74,11 @@ def assert_close(value: Tensor, expected: Tensor | tuple[Tensor, Tensor], relati
 TOLERANCE = 1e-4
 
 
-def test_texture_lookup_has_both_gradients():
-    random, weights = torch.Generator().manual_seed(1), loss_weights((9, 4, 3))
+def test_texture_lookup():
+    random = torch.Generator().manual_seed(1)
     texture = torch.rand(5, 7, 3, generator=random)
     uv = torch.rand(9, 4, 2, generator=random) * 1.2 - 0.1  # also beyond the borders
-
-    def exact(texture: Tensor, uv: Tensor) -> Tensor:
-        return (sample_texture_reference(texture.double(), uv.double()) * weights).sum()
-
-    expected = sample_texture_reference(texture.double(), uv.double())
-    torch.testing.assert_close(sample_texture(texture, uv).double(), expected, atol=1e-6, rtol=1e-6)
-    by_texture = finite_difference(lambda value: exact(value, uv), texture, 1e-3)
-    by_uv = finite_difference(lambda value: exact(texture, value), uv, 1e-7)
-    assert_close(gradient(lambda value: (sample_texture(value, uv) * weights).sum(), texture), by_texture, TOLERANCE)
-    assert_close(gradient(lambda value: (sample_texture(texture, value) * weights).sum(), uv), by_uv, 10 * TOLERANCE)
-
-
-def test_antialiasing_moves_with_silhouettes(scene: Scene):
-    image, weights = torch.rand(36, 40, 3, generator=torch.Generator().manual_seed(2)), loss_weights((36, 40, 3))
-    points = scene.points
-
-    def draw(function: Callable[..., Tensor], image: Tensor, points: Tensor) -> Tensor:
-        return function(image, scene.fragments, points, scene.faces, scene.edges)
-
-    def exact(image: Tensor, points: Tensor) -> Tensor:
-        return (draw(antialias_reference, image.double(), points.double()) * weights).sum()
-
-    expected = draw(antialias_reference, image.double(), points.double())
-    assert ((expected - image).abs().sum(-1) > 1e-3).sum() > 80
-    torch.testing.assert_close(draw(antialias, image, points).double(), expected, atol=1e-5, rtol=0)
-    by_points = finite_difference(lambda value: exact(image, value), points, 1e-7)
-    by_image = gradient(lambda value: exact(value, points), image.double())
-    assert_close(gradient(lambda value: (draw(antialias, image, value) * weights).sum(), points), by_points, TOLERANCE)
-    assert_close(gradient(lambda value: (draw(antialias, value, points) * weights).sum(), image), by_image, TOLERANCE)
+    torch.testing.assert_close(sample_texture(texture, uv), sample_texture_reference(texture, uv))
 
 
 @pytest.mark.parametrize("field", ["points", "normals", "texture", "light"])
@@ -163,11 +125,19 @@ def test_edges_of_a_square():
 @pytest.mark.parametrize("size", [256, 512])
 def test_silhouette_gradient_of_a_head_is_that_of_its_area(anny: FaceModel, size: int):
     vertices, faces, camera = anny(anny.neutral())[0], anny.faces, camera_at([0.15, 0.0, 0.6], 0.55, size)
-    fragments, edges = rasterize_mesh(vertices, faces, camera), mesh_edges(faces)
-    covered, fine = (fragments.face_index >= 0)[..., None].float(), camera.resized(2 * size, 2 * size)
+    fragments = rasterize_mesh(vertices, faces, camera)
+    mesh = LitMesh(faces, torch.zeros(len(faces), 3, 2), torch.ones(len(faces)), mesh_edges(faces))
+    white, light = torch.ones(1, 1, 3), torch.zeros(9, 3)
+    light[0] = math.sqrt(4 * math.pi)
+    black = (torch.zeros(size, size, 3), torch.ones(size, size), 1e-6)
+    covered, fine = (fragments.face_index >= 0).sum(), camera.resized(2 * size, 2 * size)
 
     def area(scale: Tensor) -> Tensor:
-        return antialias(covered, fragments, image_points(camera, vertices * scale), faces, edges).sum()
+        """The sum of a white picture before black: each pixel counts with the root of three."""
+        points = image_points(camera, vertices * scale)
+        return (
+            covered / math.sqrt(3) * mesh_loss(fragments, points, torch.ones(len(points), 3), mesh, white, light, black)
+        )
 
     def pixels(scale: float) -> float:
         return float((rasterize_mesh(vertices * scale, faces, fine).face_index >= 0).sum()) / 4
@@ -176,8 +146,12 @@ def test_silhouette_gradient_of_a_head_is_that_of_its_area(anny: FaceModel, size
 
 
 def test_native_operations_refuse_what_does_not_belong_together(scene: Scene):
+    mesh = LitMesh(scene.faces, torch.zeros(len(scene.faces), 3, 2), torch.ones(len(scene.faces)), scene.edges)
+    target = (torch.zeros(36, 40, 3), torch.ones(36, 40), 0.05)
     with pytest.raises(IndexError, match="vertex"):
-        antialias(torch.zeros(36, 40, 1), scene.fragments, scene.points[:5], scene.faces, scene.edges)
+        mesh_loss(
+            scene.fragments, scene.points[:5], torch.ones(5, 3), mesh, torch.ones(2, 2, 3), torch.ones(9, 3), target
+        )
 
 
 def barycentrics_reference(

@@ -150,9 +150,9 @@ def products_beyond_64_bits() -> None:
 
 
 def edges_with(first: int, second: int) -> None:
-    given = arguments("antialias")
+    given = arguments("mesh_loss")
     given[3].faces[0] = first, second
-    _native.antialias(*given)
+    _native.mesh_loss(*given)
 
 
 def one_frame_twice() -> str:

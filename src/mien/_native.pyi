@@ -36,25 +36,7 @@ def rasterize_mesh(
 def interpolate_mesh(
     face_index: Tensor, barycentric: Tensor, attributes: Tensor, corners: Tensor, out: Tensor
 ) -> None: ...
-
-# Gradients of points and light are float64. All gradients are added to, but those of uv and images, which are written.
 def sample_texture(texture: Tensor, uv: Tensor, out: Tensor) -> None: ...
-def sample_texture_backward(
-    texture: Tensor, uv: Tensor, grad_out: Tensor, grad_texture: Tensor | None, grad_uv: Tensor | None
-) -> None: ...
-def antialias(
-    fragments: Fragments, points: Tensor, faces: Tensor, edges: MeshEdges, image: Tensor, out: Tensor
-) -> None: ...
-def antialias_backward(
-    fragments: Fragments,
-    points: Tensor,
-    faces: Tensor,
-    edges: MeshEdges,
-    image: Tensor,
-    grad_out: Tensor,
-    grad_image: Tensor,
-    grad_points: Tensor,
-) -> None: ...
 
 class LitSurface(NamedTuple):
     normals: Tensor

@@ -302,8 +302,6 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "add_bone": lambda c: c.given("b 3", "b", "3 4", "b 3"),
     "align_mesh": lambda c: sighting(c, int(c.rng.integers(0, 9)), *(c.maybe(one, 0.7) for one in c.given(
         c.AlignDerivatives("V 3 p", "=p p", "=p"), "=H W 3", "=H W 3"))),
-    "antialias": lambda c: c.given(*with_edges(c), "H W d", "=H W d"),
-    "antialias_backward": lambda c: c.given(*with_edges(c), "H W d", "H W d", "=H W d", "=V 3:f8"),
     "bake_texture": lambda c: sighting(
         c, c.array("<t+1 G U:i4") - np.int32(1), "G U 3", c.TextureSums("=G U", "=G U 3", "=G U 3", "=G U 3")),
     "box_of_nonzero": lambda c: [np.maximum(c.array("H W") - 2, 0)],
@@ -350,7 +348,6 @@ MAKERS: dict[str, Callable[[Call], Arguments]] = {
     "rig_backward": rig_backward,
     "rig_forward": rig_forward,
     "sample_texture": lambda c: c.given("H W d", "n 2", "=n d"),
-    "sample_texture_backward": lambda c: c.given("H W d", "n 2", "n d", "=H W d", "=n 2"),
     "set_rasterize_isa": lambda c: [str(c.rng.choice(["avx512", "avx2", "sse4", "baseline", ""]))],
     "set_thread_count": lambda c: [c.size("b")],
     "sigmoid": lambda c: c.given("n m", "=n m"),

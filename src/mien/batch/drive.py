@@ -44,10 +44,10 @@ def drive(batch: Batch, rows: Sequence[Row], options: Options, work: Work | None
 
     `work` replaces the process of a row, for trials of the engines.
     """
-    if options.engine == "slurm":
+    if options.on == "slurm":
         wait_for_earlier(batch)
     left = [row for row in rows if not batch.is_done(row)]
-    say(f"{counted(len(rows), 'row')}: {len(rows) - len(left)} done before, {len(left)} to do on {options.engine}")
+    say(f"{counted(len(rows), 'row')}: {len(rows) - len(left)} done before, {len(left)} to do on {options.on}")
     with (
         progress_bar("batch", len(rows), len(rows) - len(left)) as advance,
         _telling(batch, lambda: left, advance) as advance,
@@ -56,7 +56,7 @@ def drive(batch: Batch, rows: Sequence[Row], options: Options, work: Work | None
             with ExitStack() as claims:
                 taken = _taken(batch, left, options, claims)
                 todo = work or _work(batch, taken, options)
-                for row, outcome in ENGINES[options.engine](todo, taken, batch, options) if taken else ():
+                for row, outcome in ENGINES[options.on](todo, taken, batch, options) if taken else ():
                     if _keep(batch, row, outcome, bool(options.store)):
                         advance(1, row.name)
                     elif turn == options.retry:
@@ -108,12 +108,12 @@ def _taken(batch: Batch, rows: Sequence[Row], options: Options, claims: ExitStac
 
 def _work(batch: Batch, rows: Sequence[Row], options: Options) -> Work:
     threads = options.threads or None
-    if options.engine == "local" and threads is None:
+    if options.on == "local" and threads is None:
         from mien.machine.threads import thread_count
 
         threads = max(1, thread_count() // jobs_here(rows, options))
     place = (attempt_in_store, options.store) if options.store else (attempt, batch.root.resolve())
-    return partial(*place, options.program, threads)
+    return partial(*place, options.words_of_program(), threads)
 
 
 def attempt_in_store(

@@ -137,7 +137,7 @@ def _submit(work: Work, rows: Sequence[Row], batch: Batch, options: Options, siz
     executor = submitit.SlurmExecutor(folder, max_num_timeout=10)
     executor.update_parameters(
         job_name="mien-batch",
-        time=(options.minutes or _minutes(batch)) * size,
+        time=(options.time or _minutes(batch)) * size,
         mem=f"{math.ceil(max(row.memory_mb for row in rows))}M",
         cpus_per_task=options.threads or 2,
         gpus_per_task=math.ceil(options.gpus) or None,
@@ -182,7 +182,7 @@ def run_ray(work: Work, rows: Sequence[Row], batch: Batch, options: Options) -> 
     import ray  # pyright: ignore[reportMissingImports]
     from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
-    address = options.address or os.environ.get("RAY_ADDRESS")
+    address = options.ray_address or os.environ.get("RAY_ADDRESS")
     started: dict[str, Any] = {} if address else {"include_dashboard": False}
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **started)

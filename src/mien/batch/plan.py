@@ -6,6 +6,7 @@ file writes it. DIR/logs/NAME.log has what the row's commands printed, and DIR/r
 
 import hashlib
 import json
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -14,7 +15,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from mien.disk.config import Range, decode
+from mien.disk.config import Range, check_ranges, decode
 from mien.disk.files import read_json, remove_leftovers, write_atomically, write_json
 from mien.disk.locks import BeingWrittenError, hold
 from mien.disk.reading import check_unlinked, expect_whole, inside
@@ -28,6 +29,7 @@ ROWS = "{rows}"
 _AGAIN = "run `mien batch TABLE --out DIR` again"
 _Number = Annotated[float, Range(0, 1e15)]
 """A number of which many can be added up."""
+_COUNT = Range(0, 100_000)
 
 
 @dataclass(frozen=True)
@@ -78,25 +80,39 @@ class State:
 class Options:
     """How the rows of a batch are run."""
 
-    engine: str = "local"
-    jobs: int = 0
-    """Largest number of rows at once. 0 leaves it to the engine."""
-    threads: int = 0
-    """Threads of each row. 0 leaves it to the engine."""
-    gpus: float = 0.0
-    """GPUs of each row."""
-    minutes: int = 0
-    """Time limit of a row in minutes, for Slurm. 0 derives it from finished rows."""
+    on: Literal["local", "slurm", "ray"] = "local"
+    """The engine that runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
+    retry: Annotated[int, _COUNT] = 2
+    """How often a failed row is tried again."""
+    jobs: Annotated[int, _COUNT] = 0
+    """Largest number of rows at once. 0 means as many as memory and cores allow."""
+    threads: Annotated[int, _COUNT] = 0
+    """Threads of each row. 0 shares the cores out, or asks a cluster for two."""
+    gpus: Annotated[float, Range(0, 64)] = 0.0
+    """GPUs of each row, on Slurm and Ray."""
     partition: str = ""
     """Partition of Slurm."""
-    address: str = ""
-    """Address of a Ray cluster."""
-    retry: int = 2
-    """How often a failed row is tried again."""
+    time: Annotated[int, _COUNT] = 0
+    """Time limit of a row in minutes, for Slurm. 0 means three times the longest finished row, at first a day."""
+    ray_address: str = ""
+    """Address of a Ray cluster (default: RAY_ADDRESS, or a Ray that is started here)."""
     store: str = ""
-    """URL of the store of workspaces. Empty if all nodes share the batch's folder."""
-    program: tuple[str, ...] = (sys.executable, "-m", "mien.cli", "batch-row")
-    """The command of a row's process: `mien batch-row`, by this Python."""
+    """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
+    program: str = ""
+    """Command that runs a row on a node, such as "apptainer exec mien.sif mien batch-row". The folder of
+    the batch follows it."""
+
+    def check(self) -> None:
+        """Check ranges, and that the program can be read."""
+        check_ranges(self, lambda name: f"--{name.replace('_', '-')}")
+        self.words_of_program()
+
+    def words_of_program(self) -> tuple[str, ...]:
+        """The words of the program; by default, `mien batch-row` by this Python."""
+        try:
+            return tuple(shlex.split(self.program)) or (sys.executable, "-m", "mien.cli", "batch-row")
+        except ValueError as error:
+            raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 
 
 Work = Callable[[Row], Any]

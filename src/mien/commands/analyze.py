@@ -1,16 +1,20 @@
 """`mien analyze`: the figures of a method's paper, measured on a run."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, field
 from inspect import cleandoc
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from mien.disk.reading import check_subtrees
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.lab.analysis.registry import ANALYSES, Analysis, AnalysisOptions, chosen_parts
-from mien.machine.devices import DeviceName, check_device
+from mien.machine.devices import check_device
+from mien.machine.progress import say
+from mien.machine.terminal import show
 
 
 def _about_target() -> str:
@@ -35,14 +39,7 @@ class Command:
     """Parts to measure (default: all that need no training)."""
     train: bool = False
     """Also measure the parts that need short trainings. A message says beforehand how long they take."""
-    steps: int = 3_000
-    """Number of optimiser steps of each short training."""
-    seconds: float = 2.0
-    """Seconds to spend on each timed row."""
-    device: DeviceName = "cpu"
-    """Device of short trainings and of timed drawing. cuda takes the figures of a GPU."""
-    widen: bool = False
-    """Widen the ablation of HeadGaS without blending until its PSNR gains less than 0.1 dB."""
+    options: Annotated[AnalysisOptions, tyro.conf.arg(name="")] = field(default_factory=AnalysisOptions)
     out: Path | None = None
     """Folder for the result and the short trainings (default: analysis/RUN in the workspace). Several workspaces have
     folders of their names in it (default: joined.md is in analysis of the first)."""
@@ -52,10 +49,9 @@ class Command:
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.disk.reading import check_subtrees
 
-        self._options().check()
-        check_device(self.device)
+        self.options.check()
+        check_device(self.options.device)
         workspaces = self._workspaces()
         chosen_parts(self._analysis(workspaces[0]), self.parts, self.train)
         for workspace in workspaces:
@@ -64,12 +60,8 @@ class Command:
 
     def run(self) -> None:
         """Measure the parts and write the page."""
-        import json
-
         from mien.lab.analysis.joining import join_analyses
         from mien.lab.analysis.running import run_analysis
-        from mien.machine.progress import say
-        from mien.machine.terminal import show
         from mien.pipeline.evaluate import run_sequences
 
         workspaces, contents = self._workspaces(), {}
@@ -78,7 +70,7 @@ class Command:
         for workspace in workspaces:
             run_dir = workspace.run_dir(run := workspace.pick_run(self.run_name))
             folder, sequences = self._folder(workspace, run), run_sequences(workspace, run_dir)
-            content = run_analysis(analysis, parts, run_dir, sequences, folder, self._options())
+            content = run_analysis(analysis, parts, run_dir, sequences, folder, self.options)
             contents[workspace.root.resolve().name] = content
             left = [part.name for part in analysis.parts if part.trains and part.name not in content["parts"]]
             if left:
@@ -90,9 +82,6 @@ class Command:
             say(f"Look at {folder / 'joined.md'}")
         if self.as_json:
             show(json.dumps(content, indent=1))
-
-    def _options(self) -> AnalysisOptions:
-        return AnalysisOptions(self.steps, self.seconds, self.device, self.widen)
 
     def _workspaces(self) -> list[Workspace]:
         folders = self.target[self._is_named() :]

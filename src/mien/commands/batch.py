@@ -5,17 +5,21 @@ import json
 import shlex
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, shard_of
+from mien.batch.drive import MODULES_OF_ENGINES, OPTIONS_OF_ENGINES, drive, shard_of
 from mien.batch.plan import Batch, Options, Row
+from mien.batch.progress import batch_progress, progress_text
+from mien.batch.store import store_of
 from mien.disk.config import Range
+from mien.disk.files import check_writable
 from mien.errors import UserError
-from mien.machine.terminal import show
+from mien.machine.progress import say
+from mien.machine.terminal import counted, show
 
 if TYPE_CHECKING:
     from mien.batch.paper import Paper
@@ -48,63 +52,36 @@ class Run:
     `capture`, `track`, `train` and `evaluate` replace those of the file; --lpips-weights FILE is needed for LPIPS."""
     subjects: Annotated[int, _COUNT] = 0
     """Use only the first so many subjects. 0 means all."""
-    on: Literal["local", "slurm", "ray"] = "local"
-    """The engine that runs the rows: processes of this machine, a Slurm cluster (submitit), or a Ray cluster."""
+    options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
     shard: str = ""
     """Run only rows I, I+N, ..., given as I/N with I from 1 to N. For Kubernetes, SkyPilot and GNU parallel."""
-    retry: Annotated[int, _COUNT] = 2
-    """How often a failed row is tried again."""
-    jobs: Annotated[int, _COUNT] = 0
-    """Largest number of rows at once. 0 means as many as memory and cores allow."""
-    threads: Annotated[int, _COUNT] = 0
-    """Threads of each row. 0 shares the cores out, or asks a cluster for two."""
-    gpus: Annotated[float, Range(0, 64)] = 0.0
-    """GPUs of each row, on Slurm and Ray."""
-    partition: str = ""
-    """Partition of Slurm."""
-    time: Annotated[int, _COUNT] = 0
-    """Time limit of a row in minutes, for Slurm. 0 means three times the longest finished row, at first a day."""
-    ray_address: str = ""
-    """Address of a Ray cluster (default: RAY_ADDRESS, or a Ray that is started here)."""
-    store: str = ""
-    """URL of a folder for the workspaces, such as s3://bucket/people, if nodes share no folder. Copied in and out."""
-    program: str = ""
-    """Command that runs a row on a node, such as "apptainer exec mien.sif mien batch-row". The folder of
-    the batch follows it."""
     for_all: Annotated[tuple[str, ...], tyro.conf.Fixed, tyro.conf.Suppress] = ()
     """Options of `mien create`."""
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.disk.files import check_writable
-
+        self.options.check()
+        engine, store = self.options.on, self.options.store
         for name in ("gpus", "partition", "time", "ray_address", "store"):
-            if getattr(self, name) and name not in OPTIONS_OF_ENGINES[self.on]:
-                raise UserError(f"--{name.replace('_', '-')}: changes nothing for --on {self.on}; leave it out")
-        module = MODULES_OF_ENGINES.get(self.on)
+            if getattr(self.options, name) and name not in OPTIONS_OF_ENGINES[engine]:
+                raise UserError(f"--{name.replace('_', '-')}: changes nothing for --on {engine}; leave it out")
+        module = MODULES_OF_ENGINES.get(engine)
         if module is not None and importlib.util.find_spec(module) is None:
             raise ModuleNotFoundError(f"No module named {module!r}", name=module)
         check_writable(self.out, folder=True)
         if self.shard:
             shard_of([], self.shard)
-        if self.store and "://" not in self.store:
-            raise UserError(f"--store {self.store}: give a URL, such as s3://bucket/people or file:///mnt/people")
-        if self.store:
-            from mien.batch.store import store_of
-
-            store_of(self.store)
-        self._program()
+        if store and "://" not in store:
+            raise UserError(f"--store {store}: give a URL, such as s3://bucket/people or file:///mnt/people")
+        if store:
+            store_of(store)
         if not self.table.exists():
             raise UserError(f"{self.table}: no such file or folder; give a table of captures, or a folder of videos")
 
     def run(self) -> None:
         """Run the rows, and write the results."""
-        from mien.batch.drive import drive
         from mien.batch.paper import write_table
-        from mien.batch.progress import batch_progress, progress_text
         from mien.batch.results import write_results, write_wall
-        from mien.machine.progress import say
-        from mien.machine.terminal import counted
 
         batch, (rows, paper), known = Batch(self.out), self._rows(), []
         labels = dict.fromkeys(label for row in rows for label in row.labels)
@@ -117,13 +94,9 @@ class Run:
             shown = ", ".join(dropped[:5]) + (", ..." if len(dropped) > 5 else "")
             say(f"{counted(len(dropped), 'row')} of an earlier table will not be listed any more ({shown}); files stay")
         batch.write_plan(rows)
-        cluster = (self.gpus, self.time, self.partition, self.ray_address)
-        options = Options(
-            self.on, self.jobs, self.threads, *cluster, retry=self.retry, store=self.store, program=self._program()
-        )
         chosen = shard_of(rows, self.shard) if self.shard else rows
         for some in filter(None, ([row for row in chosen if row.first], [row for row in chosen if not row.first])):
-            drive(batch, some, options)
+            drive(batch, some, self.options)
         table = write_table(batch, results := write_results(batch), paper)
         if paper is None:
             write_wall(batch, results)
@@ -150,15 +123,9 @@ class Run:
         entries = read_entries(self.table, usual, paper=True)
         paper = replace(paper, subjects=max(paper.subjects, len(entries)))
         rows = subject_rows(entries[: self.subjects or None], paper)
-        if any(row.first for row in rows) and (self.shard or self.store):
+        if any(row.first for row in rows) and (self.shard or self.options.store):
             raise UserError(f"--paper {self.paper}: subjects drive each other; leave --shard and --store out")
         return rows, paper
-
-    def _program(self) -> tuple[str, ...]:
-        try:
-            return tuple(shlex.split(self.program)) or Options.program
-        except ValueError as error:
-            raise UserError(f"--program {self.program}: {error}; write it as in a shell") from None
 
 
 @dataclass(frozen=True)
@@ -174,8 +141,6 @@ class Status:
 
     def run(self) -> None:
         """Show the status."""
-        from mien.batch.progress import batch_progress, progress_text
-
         while True:
             found = batch_progress(Batch(self.folder))
             show(json.dumps(found, indent=1) if self.as_json else progress_text(found))

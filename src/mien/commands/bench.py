@@ -11,6 +11,7 @@ import tyro
 from mien.avatar.methods import DEFAULT_METHOD, METHODS
 from mien.commands.train_options import check_method, listed_methods
 from mien.disk.config import POSITIVE, Range
+from mien.disk.files import check_writable
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 from mien.lab.benchmarking import GPU_BENCHMARKS, STEP_BENCHMARKS
@@ -64,8 +65,6 @@ class Scaling(_Timed):
 
     def check(self) -> None:
         """Check before any measurement that the chart can be written."""
-        from mien.disk.files import check_writable
-
         if self.plot is not None:
             if self.plot.suffix != ".svg":
                 raise UserError(f"--plot {self.plot}: charts are written as .svg; give a name that ends so")
@@ -183,8 +182,6 @@ class Compare:
 
     def check(self) -> None:
         """Check without heavy libraries that there is something to compare, and that it can be written."""
-        from mien.disk.files import check_writable
-
         if not self.workspaces and not self.captures:
             raise UserError("nothing to compare on; give workspace folders, or --captures NAME")
         if self.minutes and self.steps:

@@ -9,9 +9,11 @@ import tyro
 
 from mien.capture.settings import CaptureSettings
 from mien.commands.train_options import Elsewhere, TrainOptions
+from mien.disk.files import check_writable
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
-from mien.pipeline.names import check_sources, check_viewer, run_name, sequence_names
+from mien.machine.progress import say, stages
+from mien.pipeline.names import check_sources, check_viewer, doubled_videos, run_name, sequence_names
 from mien.tracking.settings import (
     PaperSettings,
     PhotometricSettings,
@@ -19,7 +21,7 @@ from mien.tracking.settings import (
     SmoothnessSettings,
     TrackingSettings,
 )
-from mien.training.settings import PRESETS, AlignmentSettings
+from mien.training.settings import PRESETS, AlignmentSettings, check_held_out
 from mien.training.settings.splits import SPLITS
 
 
@@ -87,8 +89,6 @@ class Command:
         if self.view:
             check_viewer()
         if self.growing is not None:
-            from mien.disk.files import check_writable  # imports numpy
-
             check_writable(self.growing)
         if needs := SPLITS[split := self.options.settings().split].needs:
             raise UserError(
@@ -106,7 +106,6 @@ class Command:
     def run(self) -> None:
         """Run all stages and skip those whose results are current. All possible checks come before any work."""
         from mien.evaluation.protocols import EvaluationSettings
-        from mien.machine.progress import say, stages
         from mien.pipeline.align import is_trained_on, one_camera, run_alignment_stage
         from mien.pipeline.capture import run_capture_stage
         from mien.pipeline.create import name_next_commands, show_film, show_page
@@ -114,7 +113,6 @@ class Command:
         from mien.pipeline.stage_times import FILE_NAME, StageTimes
         from mien.pipeline.track import run_tracking_stage, showing_meanwhile
         from mien.pipeline.train import run_training_stage
-        from mien.training.settings import check_held_out
 
         began = time.monotonic()
         method, settings = self.options.method_config(), self.options.settings()
@@ -167,10 +165,8 @@ class Command:
     def _check_files(self, workspace: Workspace, run: str) -> None:
         """Check what needs heavy libraries: the run, the cameras, the face model, the masks and the videos."""
         from mien.face.torso import has_torso
-        from mien.machine.progress import say
         from mien.pipeline.capture import check_camera_ids, check_captured
         from mien.pipeline.face_models import face_model_of
-        from mien.pipeline.names import doubled_videos
         from mien.pipeline.track import check_masks
         from mien.training.run import check_run, check_untouched, check_videos, is_part_of
 

@@ -9,6 +9,7 @@ import tyro
 from mien.commands.create import Command as Create
 from mien.commands.train_options import PresetName, TrainOptions
 from mien.disk.config import Range
+from mien.disk.files import check_writable
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,6 @@ class Command:
 
     def check(self) -> None:
         """Check the options without heavy libraries."""
-        from mien.disk.files import check_writable
-
         self._options().settings()
         check_writable(self.out, folder=True)
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from mien.disk.files import check_writable
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.formats.format import Format, MotionOptions, NoOptions, PoseOptions
@@ -49,8 +50,6 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.disk.files import check_writable
-
         kind, options = _kind(self.out, self.format), self.options
         kind.check(self.out, options)
         series = options.series if isinstance(options, MotionOptions) else None

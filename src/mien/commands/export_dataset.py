@@ -10,6 +10,7 @@ import tyro
 
 from mien.commands.export import any_of
 from mien.datasets.layouts.layout import LAYOUTS, MatteKind, check_new_folder, find_layout
+from mien.disk.files import check_writable
 from mien.disk.workspace import open_workspace
 from mien.errors import UserError
 
@@ -93,8 +94,6 @@ class Submission:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.disk.files import check_writable
-
         if not (self.benchmark / "calibration" / "camera_params.json").is_file():
             raise UserError(
                 f"--benchmark {self.benchmark}: has no calibration/camera_params.json; give the folder of a person of "

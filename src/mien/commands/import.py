@@ -10,6 +10,7 @@ from mien.datasets.dataset import Dataset, Findings
 from mien.datasets.registry import find_dataset, known_datasets, recognised
 from mien.disk.workspace import Workspace, check_new_workspace
 from mien.errors import UserError
+from mien.machine.progress import say
 from mien.pipeline.names import check_new_run, check_new_sequence, run_name
 
 
@@ -77,7 +78,6 @@ class Command:
             ) from None
 
     def _read(self, dataset: Dataset, told: str | None) -> None:
-        from mien.machine.progress import say
         from mien.pipeline.import_dataset import findings_lines, run_import_stage
 
         if told is not None and (self.dry_run or dataset.holds == "sequences"):

@@ -11,6 +11,7 @@ from mien.disk.config import Range
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device, choose_device, like_on
+from mien.machine.progress import say, track_progress
 from mien.pipeline.names import check_avatar
 from mien.pipeline.picture_options import PictureOptions
 
@@ -110,7 +111,6 @@ class Render(_Look):
             return
         from mien.avatar.avatar import move_avatar
         from mien.avatar.files import load_avatar
-        from mien.machine.progress import say, track_progress
         from mien.media.writing import write_pictures
         from mien.pipeline.draw import draw, posed_softly, sides_filmed, warn_of_white
         from mien.pipeline.expression import chosen_face
@@ -252,7 +252,6 @@ class Sheet(_Look):
         """Draw the sheet."""
         from mien.avatar.avatar import move_avatar
         from mien.avatar.files import load_avatar
-        from mien.machine.progress import say
         from mien.media.writing import write_pictures
         from mien.pipeline import sheets
         from mien.pipeline.draw import draw, posed_softly, sides_filmed

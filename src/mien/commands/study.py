@@ -1,18 +1,27 @@
 """Let people judge runs blind, beside the truth."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
+from mien.disk.reading import check_subtrees
 from mien.disk.workspace import Workspace, open_workspace
 from mien.errors import UserError
+from mien.lab.analysis.study.files import (
+    MOST_RUNS,
+    TALLY,
+    VERSION,
+    StudySettings,
+    key_path,
+    read_all_answers,
+    read_key,
+    tally_content,
+    tally_text,
+)
 from mien.machine.terminal import show
-
-if TYPE_CHECKING:
-    from mien.lab.analysis.study.files import StudySettings
 
 
 @dataclass(frozen=True)
@@ -29,25 +38,13 @@ class Make:
     """File for the page, .html. The key is beside it: NAME.key.json."""
     runs: tuple[str, ...] = ()
     """Names of the runs to compare, 2 to 8 (default: those that all workspaces have)."""
-    clips: int = 10
-    """Largest number of clips, spread evenly over the workspaces."""
-    seconds: float = 4.0
-    """Longest clip. A clip never crosses the end of a held-out part, so runs with --split tail or --hold-out have
-    longer clips than those with --split blocks."""
-    side: int = 384
-    """Side of each picture in pixels, a multiple of 16. It shows the square around the head."""
-    megabytes: float = 30.0
-    """Largest size of the page. Videos are compressed until they fit."""
-    seed: int = 0
-    """Seed of the choice of clips and of opaque names. The order of the methods differs for each participant and clip;
-    the page draws it from the participant's number."""
+    settings: Annotated[StudySettings, tyro.conf.arg(name="")] = field(default_factory=StudySettings)
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.disk.reading import check_subtrees
 
-        self._settings().check()
+        self.settings.check()
         if self.out.suffix.lower() != ".html":
             raise UserError(f"--out {self.out}: give a file that ends in .html")
         check_writable(self.out)
@@ -71,19 +68,12 @@ class Make:
             folders = {label: one.run_dir(label) for label in labels}
             sequences = {label: (folder, tuple(run_sequences(one, folder))) for label, folder in folders.items()}
             runs.append(StudyRuns(one.root.resolve().name, sequences))
-        write_study(self.out, runs, self._settings())
-        key = self.out.with_name(f"{self.out.stem}.key.json")
+        write_study(self.out, runs, self.settings)
+        key = key_path(self.out)
         say(f"Look at {self.out} and send it; keep {key}, then: mien study tally {key} ANSWERS.json ...")
-
-    def _settings(self) -> "StudySettings":
-        from mien.lab.analysis.study.files import StudySettings
-
-        return StudySettings(self.clips, self.seconds, self.side, self.megabytes, self.seed)
 
     def _labels(self, workspaces: list[Workspace]) -> list[str]:
         """The names of the runs: those asked for, or those that all workspaces have."""
-        from mien.lab.analysis.study.files import MOST_RUNS
-
         if self.runs:
             for workspace in workspaces:
                 for name in self.runs:
@@ -115,7 +105,6 @@ class Tally:
     def check(self) -> None:
         """Read the key and all answers, and check that the result can be written, without heavy libraries."""
         from mien.disk.files import check_writable
-        from mien.lab.analysis.study.files import read_all_answers, read_key
 
         if not self.key.is_file():
             raise UserError(f"{self.key}: no such file; give the key that `mien study make` wrote beside the page")
@@ -128,7 +117,6 @@ class Tally:
     def run(self) -> None:
         """Print the percentages."""
         from mien.disk.files import write_json
-        from mien.lab.analysis.study.files import TALLY, VERSION, read_all_answers, read_key, tally_content, tally_text
 
         key = read_key(self.key)
         content = tally_content(key, read_all_answers(self.answers, key))

@@ -8,7 +8,7 @@ import tyro
 
 from mien.commands.train_options import TrainOptions
 from mien.disk.workspace import open_workspace
-from mien.pipeline.names import check_viewer
+from mien.pipeline.names import check_viewer, run_name
 from mien.training.settings import PRESETS, check_held_out
 from mien.training.settings.splits import SPLITS, Recordings, fill_in
 
@@ -29,8 +29,6 @@ class Command:
 
     def check(self) -> None:
         """Check options and paths without heavy libraries."""
-        from mien.pipeline.names import run_name
-
         self.options.check()
         if self.view:
             check_viewer()
@@ -41,7 +39,6 @@ class Command:
 
     def run(self) -> None:
         """Train the run to its end."""
-        from mien.pipeline.names import run_name
         from mien.pipeline.train import fill_in_split, run_training_stage
         from mien.training.run import check_run
 

@@ -15,6 +15,7 @@ from mien.disk.config import no_such_setting, overlay, shown
 from mien.disk.reading import parse_json, read_bytes
 from mien.errors import UserError
 from mien.machine.devices import DeviceName, check_device
+from mien.machine.progress import say
 from mien.training.settings import PRESETS, Split, TrainSettings, doubly_held_out
 from mien.training.settings.splits import NAMED_SPLIT
 
@@ -177,8 +178,6 @@ class TrainOptions:
 
     def say_what_is_ignored(self) -> None:
         """Report the entry of the file that the run does not use (the sequences of its own run), and doubled splits."""
-        from mien.machine.progress import say
-
         doubled = doubly_held_out(self.settings())
         if doubled is not None:
             say(f"warning: {doubled}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from mien.datasets import content
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
+from mien.disk.reading import read_bytes
 from mien.errors import UserError
 
 if TYPE_CHECKING:
@@ -57,8 +58,6 @@ def _survey(path: Path) -> Findings:
 
 def _read_landmarks(root: Path, path: Path) -> np.ndarray:
     """The 478 points of a .lms file in pixels; NaN if the file is missing."""
-    from mien.disk.reading import read_bytes
-
     if not content.is_file_inside(root, path):
         return np.full((_LANDMARKS, 2), np.nan)
     try:

@@ -4,6 +4,7 @@ The monocular task has tracking; its test sequences have no pictures and are not
 there: the whole model is turned, scaled and shifted about the origin of the model.
 """
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mien.datasets.content import REMEDY, check_file_inside, is_file_inside
+from mien.datasets.content import REMEDY, check_file_inside, is_file_inside, read_arrays
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.datasets.nersemble import CALIBRATION, FRONTAL, frames_in, has_mattes, read_cameras
 from mien.errors import UserError
-from mien.training.settings.splits import HIDDEN_CAMERAS
+from mien.training.settings.splits import HIDDEN_CAMERAS, OwnSplit
 
 if TYPE_CHECKING:
     from mien.camera import Camera
@@ -73,8 +74,6 @@ def flame_from_benchmark(file: Path) -> "tuple[dict[str, np.ndarray], np.ndarray
 
     Rotations are those of `rotation_matrices`. The Euler angles of `rotation` must say the same.
     """
-    from mien.datasets.content import read_arrays
-
     axes = {
         "shape": "1s", "expression": "te", "rotation": "t3", "rotation_matrices": "t33", "translation": "t3",
         "scale": "11", "jaw": "t3", "neck": "t3", "eyes": "t6",
@@ -104,8 +103,6 @@ def _euler_xyz(angles: np.ndarray) -> np.ndarray:
 
 def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndarray]":
     """Serial numbers, pictures and mattes of a sequence's videos."""
-    import itertools
-
     from mien.datasets.pictures import collect
     from mien.media.video import count_frames, read_video_frames
 
@@ -140,8 +137,6 @@ def _pictures(folder: Path, root: Path) -> "tuple[list[str], np.ndarray, np.ndar
 
 def _own_split(folder: Path, timesteps: int) -> "OwnSplit | None":
     """The split of a folder that `mien export-dataset` wrote, whose held-out frames are a sequence of their own."""
-    from mien.training.settings.splits import OwnSplit
-
     if folder.name.endswith(TEST_ENDING):
         return OwnSplit(((0, timesteps),))
     return OwnSplit() if folder.with_name(f"{folder.name}{TEST_ENDING}").is_dir() else None

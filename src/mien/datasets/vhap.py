@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mien.datasets.content import REMEDY, inner, numbers, read_frames, scalars, sniff, stacked_poses
+from mien.datasets.content import REMEDY, inner, numbers, read_frames, read_some_arrays, scalars, sniff, stacked_poses
 from mien.datasets.dataset import Clip, Dataset, Findings, ReadSequence
 from mien.disk.reading import is_plain_name
 from mien.errors import UserError
@@ -142,8 +142,6 @@ def _viewmats(group: _Group) -> dict[str, np.ndarray]:
 
 def _flame_arrays(group: _Group, root: Path) -> dict[str, np.ndarray]:
     """The arrays of all timesteps, as in flame_param.npz of GaussianAvatars."""
-    from mien.datasets.content import read_some_arrays
-
     rows: dict[str, list[np.ndarray]] = {name: [] for name in (*_PARAMETERS, "dynamic_offset")}
     shared: dict[str, np.ndarray] = {}
     for timestep in group.timesteps:

@@ -1,7 +1,6 @@
 """From an avatar and a motion to pictures."""
 
 import hashlib
-import itertools
 from functools import partial
 from pathlib import Path
 
@@ -156,7 +155,7 @@ def run_driving_stage(
         width = max(1, round(theirs.shape[1] * camera.height / theirs.shape[0]))
         return side_by_side([cv2.resize(theirs, (width, camera.height), interpolation=cv2.INTER_AREA), shown])
 
-    frames = (frame(timestep) for timestep in itertools.islice(itertools.count(), len(driven)))
+    frames = map(frame, range(len(driven)))
     sound = None if driver.sound is None else (driver.sound, len(driven) / driver.fps)
     if sound is not None and output.kind != "mp4":
         say(f"{out}: has no sound; only an .mp4 gets that of {driver.sound}")

@@ -1,17 +1,15 @@
 """Triangle meshes: visible fragments, interpolation, textures, simple light, pictures.
 
-Pictures are differentiable in interpolated attributes, textures and light, and with `mien.render.mesh_gradients` in the
-vertices. Everything runs on one CPU thread and releases the GIL, so several Python threads can each draw a frame.
+`mien.render.mesh_gradients` has gradients. Everything runs on one CPU thread and releases the GIL, so several Python
+threads can each draw a frame.
 """
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample, normalize
 
 from mien import _native
@@ -110,32 +108,12 @@ def interpolate_reference(
 def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n c"]:
     """Sample a float32 texture bilinearly, clamped at the borders.
 
-    The point (0, 0) is the lower left corner of the texture's picture, and v goes up. The result is differentiable in
-    both arguments.
+    The point (0, 0) is the lower left corner of the texture's picture, and v goes up. The result is not differentiable.
     """
-    return _SampleTexture.apply(texture, uv)  # pyright: ignore[reportReturnType]
-
-
-class _SampleTexture(torch.autograd.Function):
-    """Bilinear texture look-up at any number of points."""
-
-    @staticmethod
-    def forward(ctx: Any, texture: Tensor, uv: Tensor):
-        texture, flat = texture.detach().contiguous(), uv.detach().reshape(-1, 2).contiguous()
-        out = torch.empty(len(flat), texture.shape[2])
-        _native.sample_texture(texture, flat, out)
-        ctx.save_for_backward(texture, flat)
-        return out.view(*uv.shape[:-1], -1)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor):
-        texture, flat = ctx.saved_tensors
-        grad_texture = torch.zeros_like(texture) if ctx.needs_input_grad[0] else None
-        grad_uv = torch.empty_like(flat) if ctx.needs_input_grad[1] else None
-        rows = grad.reshape(len(flat), -1).contiguous()
-        _native.sample_texture_backward(texture, flat, rows, grad_texture, grad_uv)
-        return grad_texture, None if grad_uv is None else grad_uv.view(*grad.shape[:-1], 2)
+    flat = uv.detach().reshape(-1, 2).contiguous()
+    out = torch.empty(len(flat), texture.shape[2])
+    _native.sample_texture(texture.detach().contiguous(), flat, out)
+    return out.view(*uv.shape[:-1], -1)
 
 
 def sample_picture(picture: Float[Tensor, "h w c"], grid: Float[Tensor, "v 2"], mode: str) -> Float[Tensor, "v c"]:

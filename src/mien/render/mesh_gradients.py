@@ -1,7 +1,7 @@
 """Gradients of pictures of meshes with respect to the mesh: through the visible surface and through silhouettes.
 
-There are single operations (`image_points`, `sample_texture`, `antialias`) and one that combines them with light and a
-robust loss in a single pass (`mesh_loss`). They run on one thread, release the GIL, and are deterministic to the bit.
+`mesh_loss` draws a lit, textured mesh and compares it with a picture, with all gradients in a single pass. It runs on
+one thread, releases the GIL, and is deterministic to the bit.
 """
 
 from dataclasses import dataclass
@@ -71,51 +71,6 @@ def image_points(camera: Camera, vertices: Float[Tensor, "v 3"]) -> Float[Tensor
     return (vertices @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
 
 
-def antialias(
-    image: Float[Tensor, "h w c"],
-    fragments: MeshFragments,
-    points: Float[Tensor, "v 3"],
-    faces: Int[Tensor, "f 3"],
-    edges: MeshEdges,
-) -> Float[Tensor, "h w c"]:
-    """Blend a picture across silhouettes, which makes it differentiable in their positions.
-
-    If a silhouette passes between the centres of two neighbouring pixels, the pixel that it crosses gets the share of
-    the other's colour that it should have (as in Laine et al. 2020, section 3.6). Silhouettes are found by walking the
-    mesh's own edges, because the triangles visible at a contour are slivers, and their edges miss most crossings. An
-    edge counts if the outer pixel shows something farther away. Of several crossings between two pixels only the
-    outermost counts.
-    """
-    fixed = (fragments.face_index, fragments.barycentric.detach(), fragments.depth, faces)
-    fixed = (*fixed, edges.vertices, edges.faces, edges.opposite)
-    return _Antialias.apply(image, points, *fixed)  # pyright: ignore[reportReturnType]
-
-
-class _Antialias(torch.autograd.Function):
-    """A picture blended along the silhouettes of the mesh that it shows."""
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, points: Tensor, *mesh: Tensor):
-        *fragments, faces, edge_vertices, edge_faces, opposite = mesh
-        image, points = image.detach().contiguous(), points.detach()
-        out = torch.empty_like(image)
-        edges = _native.MeshEdges(edge_vertices, edge_faces, opposite)
-        _native.antialias(_native.Fragments(*fragments), points, faces, edges, image, out)
-        ctx.save_for_backward(image, points, *mesh)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor):
-        image, points, *fragments, faces, edge_vertices, edge_faces, opposite = ctx.saved_tensors
-        grad_image, grad_points = torch.empty_like(image), torch.zeros(points.shape, dtype=torch.float64)
-        edges = _native.MeshEdges(edge_vertices, edge_faces, opposite)
-        _native.antialias_backward(
-            _native.Fragments(*fragments), points, faces, edges, image, grad.contiguous(), grad_image, grad_points
-        )
-        return grad_image, grad_points.float(), *([None] * (len(ctx.saved_tensors) - 2))
-
-
 def mesh_loss(
     fragments: MeshFragments,
     points: Float[Tensor, "v 3"],
@@ -128,8 +83,14 @@ def mesh_loss(
 ) -> Float[Tensor, ""]:
     """Difference between the lit, textured mesh and a picture, differentiable in points, normals, texture and light.
 
-    The drawn picture is albedo times light (spherical harmonics), antialiased along `mesh.edges`, with the target as
-    background, so only pixels that the mesh covers can differ. The loss is the mean over pixels, weighted by mask and
+    The drawn picture is albedo times light (spherical harmonics), with the target as background, so only pixels that
+    the mesh covers can differ. It is blended across silhouettes, which makes it differentiable in their positions: if
+    one passes between the centres of two neighbouring pixels, the pixel that it crosses gets the share of the other's
+    colour that it should have (as in Laine et al. 2020, section 3.6). Silhouettes are found by walking `mesh.edges`,
+    because the triangles visible at a contour are slivers, and their edges miss most crossings. An edge counts if the
+    outer pixel shows something farther away. Of several crossings between two pixels only the outermost counts.
+
+    The loss is the mean over pixels, weighted by mask and
     triangle, of sqrt(|difference|^2 + epsilon^2) - epsilon over the three colours together (Charbonnier). It pulls on
     outliers like L1 but has no kink.
 

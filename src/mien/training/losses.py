@@ -4,7 +4,7 @@ The photometric loss is that of Gaussian splatting: L1 and SSIM (Wang et al. 200
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,10 +61,19 @@ def photometric_loss(
         return photometric_loss_reference(
             image, target, l1_weight, ssim_weight, box if drawn is None else None, parts, part_weight
         )
+    weights, inside = (l1_weight, ssim_weight), _clipped(box, image)
     boxes = [_clipped(part, image) for part in parts if part_weight > 0]
-    return _PhotometricLoss.apply(
-        image, target, _clipped(box, image), drawn, (l1_weight, ssim_weight), boxes, part_weight
-    )
+
+    def compute(differentiable: bool) -> tuple[Tensor, Tensor | None]:
+        gradient, loss = recycled(*image.shape) if differentiable else None, recycled()
+        shown = None if drawn is None else drawn.contiguous()
+        pictures = unpacked(image.contiguous(), target.contiguous(), shown, gradient, loss)
+        _native.photometric_loss(inside, weights, *pictures)
+        for part in boxes:
+            loss += _add_part(part, image, target, weights, part_weight, gradient)
+        return loss, gradient
+
+    return _one_pass(image, compute)
 
 
 def photometric_loss_reference(
@@ -102,28 +111,24 @@ def differentiable_ssim_map(image: Float[Tensor, "h w c"], target: Float[Tensor,
     return numerator / ((mean_x * mean_x + mean_y * mean_y + C1) * (variance_x + variance_y + C2))
 
 
-class _PhotometricLoss(torch.autograd.Function):
-    """One native pass computes value and gradient; `backward` only scales the gradient."""
-
+class _OnePass(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, target: Tensor, box: Box, drawn: Tensor | None, weights: tuple[float, float],
-        parts: Sequence[Box], part_weight: float,
-    ) -> Tensor:  # fmt: skip
-        gradient = recycled(*image.shape) if ctx.needs_input_grad[0] else None
-        drawn = None if drawn is None else drawn.contiguous()
-        loss = recycled()
-        pictures = unpacked(image.contiguous(), target.contiguous(), drawn, gradient, loss)
-        _native.photometric_loss(box, weights, *pictures)
-        for part in parts:
-            loss += _add_part(part, image, target, weights, part_weight, gradient)
-        ctx.gradient = gradient
+    def forward(ctx: Any, values: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor | None]]) -> Tensor:
+        loss, ctx.gradient = compute(ctx.needs_input_grad[0])
         return loss
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        return times(ctx.gradient, grad_loss), *[None] * 6
+    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None]:
+        return times(ctx.gradient, grad_loss), None
+
+
+def _one_pass(values: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor | None]]) -> Float[Tensor, ""]:
+    """A loss that is differentiable in `values`, and whose gradient is computed together with it.
+
+    `compute` returns both, the gradient if it is asked for one. Later derivatives only scale it.
+    """
+    return _OnePass.apply(values, compute)  # pyright: ignore[reportReturnType]
 
 
 def _add_part(
@@ -196,24 +201,14 @@ def alpha_loss_reference(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"
 @native(alpha_loss_reference, gpu="mien.training.losses_gpu")
 def alpha_loss(alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Float[Tensor, ""]:
     """`weight` times the mean absolute difference between alpha and a matte (0..255). Native for float32 on a CPU."""
-    return _AlphaLoss.apply(alpha, matte, weight)  # pyright: ignore[reportReturnType]
 
-
-class _AlphaLoss(torch.autograd.Function):
-    """One native pass computes value and gradient; `backward` only scales the gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, alpha: Float[Tensor, "h w"], matte: UInt8[Tensor, "h w"], weight: float) -> Tensor:
-        gradient, loss = recycled(*alpha.shape), recycled()
+    def compute(_: bool) -> tuple[Tensor, Tensor]:
+        gradient, loss = recycled_like(alpha), recycled()
         values, target, *filled = unpacked(alpha.contiguous(), matte.contiguous(), gradient, loss)
         _native.absolute_difference(values, target, weight, *filled)
-        ctx.gradient = gradient
-        return loss
+        return loss, gradient
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        return times(ctx.gradient, grad_loss), None, None
+    return _one_pass(alpha, compute)
 
 
 def color_loss_reference(
@@ -240,25 +235,15 @@ def color_loss(
 
     Pixels that are not `counted` add 0 to the mean. Native for float32 on a CPU.
     """
-    return _ColorLoss.apply(image, picture, weight, free, counted)  # pyright: ignore[reportReturnType]
 
-
-class _ColorLoss(torch.autograd.Function):
-    """One native pass computes value and gradient; `backward` only scales the gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, picture: Tensor, weight: float, free: float, counted: Tensor | None) -> Tensor:
+    def compute(_: bool) -> tuple[Tensor, Tensor]:
         gradient, loss = recycled_like(image), recycled()
         known = None if counted is None else counted.contiguous().view(torch.uint8)
         own, target, chosen, *filled = unpacked(image.contiguous(), picture.contiguous(), known, gradient, loss)
         _native.color_difference(own, target, chosen, weight, free, *filled)
-        ctx.gradient = gradient
-        return loss
+        return loss, gradient
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, ...]:
-        return times(ctx.gradient, grad_loss), None, None, None, None
+    return _one_pass(image, compute)
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,14 +45,16 @@ class StudySettings:
     clips: Annotated[int, Range(1, 200)] = 10
     """Largest number of clips, spread evenly over the workspaces. The paper showed 10."""
     seconds: Annotated[float, Range(0.1, 60)] = 4.0
-    """Longest clip, in seconds. A clip never crosses the end of a held-out part."""
+    """Longest clip. A clip never crosses the end of a held-out part, so runs with --split tail or --hold-out have
+    longer clips than those with --split blocks."""
     side: Annotated[int, Range(64, 1024)] = 384
-    """Side of each picture in pixels: a multiple of H.264's blocks, so that no block holds pixels of two tiles."""
+    """Side of each picture in pixels, a multiple of 16 (H.264's blocks, none of which then holds pixels of two tiles).
+    It shows the square around the head."""
     megabytes: Annotated[float, Range(1, 1000)] = 30.0
     """Largest size of the page, in millions of bytes. Videos are compressed until they fit."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
-    """Seed of the choice of clips and of the page's opaque names. The same seed, runs and settings give the same
-    page."""
+    """Seed of the choice of clips and of opaque names. The order of the methods differs for each participant and clip;
+    the page draws it from the participant's number. The same seed, runs and settings give the same page."""
 
     def check(self) -> None:
         """Check that all numbers are in their ranges."""
