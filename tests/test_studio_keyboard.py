@@ -44,7 +44,7 @@ def test_the_keyboard_alone_is_enough(tmp_path: Path) -> None:
         done = [browse(serving.address, steps=films, **options)]
         done.append(browse(serving.address, steps=makes, **options))
         # What is stopped before it has begun is as if it had not been asked for.
-        until(lambda: (told(serving, "GET", person("Ada"))[1]["progress"]["stage"] or {}).get("percent"), HOUR)
+        until(lambda: (told(serving, "GET", person("Ada"))[1]["progress"]["stage"] or {}).get("percent") == 20, HOUR)
         done.append(browse(serving.address, steps=stops, **options))
         chosen = told(serving, "GET", person("Ada"))[1]["settings"]
         assert (chosen["quality"], chosen["shoulders"], chosen["keep_film"]) == ("draft", True, False)
