@@ -25,10 +25,10 @@ SHORT = (*STUB, "short")
 
 
 @contextmanager
-def studio(root: Path, program: Sequence[str] = STUB, **more: Any) -> Iterator[Serving]:
-    """Serve a folder. Avatars are made by `make_stub`, in processes of their own."""
+def studio(root: Path, program: Sequence[str] | None = STUB, **more: Any) -> Iterator[Serving]:
+    """Serve a folder. Avatars are made by `make_stub`, in processes of their own; without a program, as people have it."""
     root.mkdir(exist_ok=True)
-    serving = Serving(root, maker=Maker(People(root), program), **more)
+    serving = Serving(root, maker=None if program is None else Maker(People(root), program), **more)
     try:
         yield serving
     finally:

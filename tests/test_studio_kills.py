@@ -1,4 +1,4 @@
-"""A studio that is killed in each stage of a real making: the next one goes on, and what was made stays."""
+"""Real makings of a studio: it says why one fails, and goes on after a kill in each stage."""
 
 import os
 import signal
@@ -11,11 +11,12 @@ import pytest
 
 pytest.importorskip("starlette")
 
+from capture_helpers import write_gradient_video
 from mien.batch.plan import Batch
 from mien.batch.progress import stage_of
 from mien.studio.making import Maker, Settings
 from mien.studio.people import People
-from studio_case import SHORT, give_film
+from studio_case import SHORT, give_film, studio
 from web_case import until
 
 DAY = 86_400.0
@@ -31,6 +32,28 @@ from studio_case import SHORT, studio
 with studio(Path({root!r}), SHORT) as serving:
     serving.wait()
 """
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        (None, "no face"),
+        (("/proc/nowhere/mien",), "No such file or directory"),
+    ],
+    ids=["without a face", "without a program"],
+)
+def test_a_making_that_fails_says_why(program: tuple[str, ...] | None, words: str, tmp_path: Path) -> None:
+    """The first is made by mien itself, as in a studio that a person has started."""
+    film, people = tmp_path / "grey.mp4", tmp_path / "people"
+    write_gradient_video(film, frames=50)
+    with studio(people, program) as serving:
+        give_film(serving.maker.people, "Ada", film)
+        serving.maker.add("Ada", Settings("draft", threads=1))
+        until(lambda: serving.maker.progress("Ada").state == "failed", DAY)
+        assert words in serving.maker.progress("Ada").error
+        serving.maker.add("Ada", Settings("draft", threads=1))
+        assert serving.maker.progress("Ada").state != "failed", "it is tried again"
 
 
 @pytest.mark.unchecked

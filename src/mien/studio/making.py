@@ -20,7 +20,6 @@ from mien.disk.config import decode
 from mien.disk.reading import remove_tree
 from mien.disk.workspace import Workspace
 from mien.errors import UserError
-from mien.machine.terminal import tell
 from mien.studio.people import People
 
 QUALITIES = ("draft", "standard", "fine")
@@ -105,7 +104,7 @@ class Pace:
 class Maker:
     """Makes the avatars of the queue, one after the other, in a thread of its own."""
 
-    def __init__(self, people: People, program: Sequence[str] = Options().program) -> None:
+    def __init__(self, people: People, program: Sequence[str] = Options().words_of_program()) -> None:
         """Take the queue of a folder. `program` is the command of a row's process."""
         self.people, self._program = people, program
         self.batch = Batch(people.root / ".studio")
@@ -113,6 +112,7 @@ class Maker:
         self._running: str | None = None
         self._printed = 0  # bytes of the log before this attempt
         self._pace: Pace | None = None
+        self._faults: dict[str, str] = {}
         self._ended = False
         if not (self.batch.root / "plan.json").is_file():
             self.batch.write_plan([])
@@ -142,6 +142,7 @@ class Maker:
             for masks in self.people.folder(name).glob("sequences/*/scoring"):
                 remove_tree(masks)  # An avatar with shoulders is scored on other pixels.
         self.people.write(name, settings=asdict(settings))
+        self._faults.pop(name, None)
         with self._change:
             if any(each.name == name for each in self._queue):
                 raise UserError(f"{name}: is being made, or waits for it; stop that first")
@@ -177,6 +178,8 @@ class Maker:
         if name in queue:
             return Progress("waiting", before=queue.index(name))
         state = self.batch.read_state(name)
+        if name in self._faults:
+            return Progress("failed", error=self._faults[name])
         if state is None:
             return Progress("done" if self.run_of(name) else "new")
         stage = stage_of(self.batch.log_file(name)) if state.status != "done" else None
@@ -214,7 +217,7 @@ class Maker:
             try:
                 self._make(row)
             except Exception as error:  # the disk is full, or the folder is gone; the others are made all the same
-                tell(f"mien: {row.name}: {error}")
+                self._faults[row.name] = f"{error}"
                 self._conclude(row, None)
             finally:
                 self._running = None
@@ -228,9 +231,7 @@ class Maker:
         began = None if self._printed else (time.monotonic(), 0.0)  # an earlier attempt has done a part
         self._pace = Pace(settings.quality, self._usual(settings.quality), began)
         state = attempt(self.batch.root, self._program, settings.threads or None, row)
-        with self._change:
-            is_next = any(each is row for each in self._queue[:1])
-        if self._ended or not is_next:
+        if self._ended or not any(each is row for each in self._queue):
             return  # stopped by the end of the studio, or by a person
         if state is None:
             time.sleep(1.0)  # the process of a studio that was killed is about to end

@@ -21,7 +21,6 @@ from mien.errors import UserError
 RECORD = ("mien.studio-person", 1)
 _RECORD_FILE = "studio.json"
 ENDINGS = ("webm", "mp4", "mov", "m4v", "mkv", "avi")
-"""Endings of films that are taken."""
 MOST_CHUNK = 8 << 20
 """Largest piece of a film in one request, in bytes."""
 MOST_FILM = 4 << 30
