@@ -26,7 +26,7 @@ SHORT = (*STUB, "short")
 
 @contextmanager
 def studio(root: Path, program: Sequence[str] | None = STUB, **more: Any) -> Iterator[Serving]:
-    """Serve a folder. Avatars are made by `make_stub`, in processes of their own; without a program, as people have it."""
+    """Serve a folder. Avatars are made by `make_stub`, in processes of their own, or by mien if `program` is None."""
     root.mkdir(exist_ok=True)
     serving = Serving(root, maker=None if program is None else Maker(People(root), program), **more)
     try:
