@@ -15,6 +15,7 @@ from dataset_scene import Scene, scene_of
 from mien.batch import drive
 from mien.batch.paper import read_paper
 from mien.cli import main
+from mien.commands import batch as batch_command
 from mien.commands.batch_paper import with_runs
 from mien.commands.batch_table import read_table
 from mien.disk.files import write_arrays
@@ -148,7 +149,7 @@ def test_subjects_drive_each_other_once_all_are_imported(tmp_path: Path, scene: 
     )
     batches, whole = [], drive.drive
     monkeypatch.setattr(
-        drive,
+        batch_command,
         "drive",
         lambda batch, rows, *more: batches.append([row.name for row in rows]) or whole(batch, rows, *more),
     )

@@ -19,8 +19,8 @@ let detach = () => {};
 /** Shows on the stage what there is: the camera, a film, the living avatar, the growing one, or nothing yet. */
 export function showStage(): void {
   if (!now.whole) return;
-  const { name, progress, made } = now.whole, making = progress.state === "making";
-  const driven = webcam.state !== "off", living = made && !making ? person(name, "take", "page") : "";
+  const { takings, name, progress, made } = now.whole, making = progress.state === "making";
+  const driven = webcam.state !== "off", living = made && !making && takings.some((each) => each.kind === "page") ? person(name, "take", "page") : "";
   const shows = now.filming ? "camera" : driven ? "grown" : now.chosen ? "review" : living ? "living" : making && now.whole.growing ? "grown" : making && now.whole.fit && progress.stage?.name === "tracking" ? "fit" : now.whole.face ? "poster" : "empty";
   for (const id of ["review", "living", "grown", "fit", "poster", "empty"]) find(id).hidden = id !== shows;
   for (const id of ["camera", "rings", "bar"]) find(id).toggleAttribute("hidden", shows !== "camera");
