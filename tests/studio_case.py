@@ -92,7 +92,7 @@ def make_stub(batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[
 def make_short(batch: Batch, row: Row) -> tuple[tuple[dict[str, Any], ...], dict[str, float]]:
     """Make an avatar by the commands of a row, in few steps."""
     create, export = row.steps
-    few = ("--steps", "60")
+    few = ("--steps", "60", "--alignment.when", "always")
     return do_steps(main, batch, replace(row, steps=((*create, *few), export)))
 
 

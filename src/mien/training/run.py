@@ -141,6 +141,8 @@ def run_camera(run_dir: Path) -> Camera:
     with expect_whole(run_dir / "config.json", _REMEDY):
         stored = config["data"][0]["camera"]
         K, viewmat = (torch.tensor(stored[name], dtype=torch.float32) for name in ("K", "viewmat"))
+        if (K.shape, viewmat.shape) != ((3, 3), (4, 4)):
+            raise ValueError("the camera's K and viewmat are not 3x3 and 4x4")
         return Camera(K, viewmat, stored["width"], stored["height"])
 
 
